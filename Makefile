@@ -1,0 +1,25 @@
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check pins
+
+# One thread for each worker of a parallel run: torch and lavapipe would each take every core.
+PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-7s %s\n", $$1, $$2}' Makefile
+
+setup: ## make .venv/ and install what it needs from the system
+	@./setup.sh
+
+demo: setup ## demonstrations, training, evaluation and a video, end to end
+	@examples/demo.sh
+
+test: setup ## every test
+	$(PARALLEL)
+
+check: setup ## lint, and the tests that need neither simulator nor training
+	.venv/bin/ruff check
+	.venv/bin/ruff format --check
+	$(PARALLEL) -q -m "not sim and not slow"
+
+pins: ## resolve pyproject.toml afresh into constraints.txt
+	@./setup.sh pins
