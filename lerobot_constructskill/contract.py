@@ -1,0 +1,137 @@
+"""The one table: tasks, cameras, action and state names, units and rates. Standard library only.
+
+Every other room reads its numbers here, so a number that a data set, an environment, an expert and a policy
+must agree on is written once. Geometry of a task's own assets stands in its scene file and reaches the experts
+as privileged state.
+"""
+
+from dataclasses import dataclass
+
+FPS = 20
+"""Control rate in Hz: ManiSkill's default, and the frame rate of every data set."""
+
+IMAGE_SIZE = 224
+"""Height and width of every camera image, in pixels (paper, section II)."""
+
+ACTION_SCALE = 0.1
+"""Metres (and radians) that ManiSkill's normalised `pd_ee_delta_pose` calls 1.0."""
+
+GRIPPER_OPEN, GRIPPER_CLOSED = 1.0, -1.0
+
+TRANSLATION = ("dx", "dy", "dz")
+"""End-effector displacement asked for in one step, in metres, in the robot's base frame."""
+
+GRIPPER = "gripper"
+"""Last action channel: +1 open, -1 closed."""
+
+STATE_NAMES = ("ee_x", "ee_y", "ee_z", "ee_rx", "ee_ry", "ee_rz", "finger_left", "finger_right")
+"""Proprioception: position in metres and axis-angle in radians in the robot's base frame, fingers in metres."""
+
+SIM_STATE = {
+    "tcp_pose": 7,
+    "fingers": 2,
+    "object_pose": 7,
+    "object_size": 3,
+    "object_mass": 1,
+    "bin_position": 3,
+    "bin_interior": 3,
+}
+"""Privileged state, name to length: SI units, world frame, poses as position and (w, x, y, z) quaternion."""
+
+DEMO_SEED_START = 1_000_000
+"""First seed of a data set. LeRobot's evaluations start at the training seed or at 1000."""
+
+REWARD_LIFTED, REWARD_PLACED = 0.5, 1.0
+"""The reward of a step is the stage its episode has reached; 0 before the object is lifted."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera of the contract.
+
+    Args:
+        name: the camera's part in `observation.images.<name>`.
+        fov: vertical field of view in radians.
+        eye: position in the world in metres, or in the frame of `mount` where one is named.
+        target: the world point looked at, in metres; unused by a mounted camera.
+        mount: the robot link that carries the camera, or None for a fixed one.
+    """
+
+    name: str
+    fov: float
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float] | None = None
+    mount: str | None = None
+
+    @property
+    def key(self) -> str:
+        return f"observation.images.{self.name}"
+
+
+CAMERAS = {
+    camera.name: camera
+    for camera in (
+        Camera("base", fov=1.5707963267948966, eye=(-1.0, -1.3, 0.9), target=(0.0, -0.35, 0.2)),
+        Camera("wrist", fov=1.5707963267948966, eye=(0.0464982, -0.0200011, 0.0360011), mount="panda_hand"),
+    )
+}
+
+OBS_TYPES = {"pixels": ("base",), "pixels_agent_pos": ("base", "wrist")}
+"""Cameras of each `obs_type`; `pixels_agent_pos` adds the 8-number state as well."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row of the table.
+
+    Args:
+        name: what `--env.task` takes.
+        env_id: the ManiSkill environment id.
+        instruction: the sentence in the data set's `task` and the environment's `task_description`.
+        horizon: default length of an evaluation episode, in steps.
+        scene: `module:class` of the ManiSkill environment.
+        expert: `module:class` of the scripted expert.
+        action_names: channels of `action`, translations (and rotations) first, the gripper last.
+    """
+
+    name: str
+    env_id: str
+    instruction: str
+    horizon: int
+    scene: str
+    expert: str
+    action_names: tuple[str, ...] = (*TRANSLATION, GRIPPER)
+
+
+TASKS = {
+    task.name: task
+    for task in (
+        Task(
+            name="brick_to_bin",
+            env_id="ConstructionPickPlace-ViT-v1",
+            instruction="Pick up the brick and place it in the bin.",
+            horizon=700,
+            scene="lerobot_constructskill.sim.tasks.brick:BrickToBinEnv",
+            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+        ),
+        Task(
+            name="block_to_bin",
+            env_id="ConstructionBlockPickPlace-v1",
+            instruction="Pick up the concrete block and place it in the bin.",
+            horizon=700,
+            scene="lerobot_constructskill.sim.tasks.block:BlockToBinEnv",
+            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+        ),
+    )
+}
+
+
+def get_task(name: str) -> Task:
+    """Return the row called `name`.
+
+    Raises:
+        ValueError: there is no such task; the message lists those there are.
+    """
+    if name not in TASKS:
+        raise ValueError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}.")
+    return TASKS[name]

@@ -1,0 +1,292 @@
+"""The shared pick-and-place environment: robot, bin, cameras, initial states and the containment test.
+
+A task derives from `PickPlaceEnv`, loads its asset and, where the layout differs, sets four geometry constants.
+"""
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.building import ActorBuilder
+from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
+from mani_skill.utils.sapien_utils import look_at
+from mani_skill.utils.structs import Actor, Pose
+from transforms3d.euler import euler2quat
+
+from lerobot_constructskill.contract import (
+    CAMERAS,
+    FPS,
+    IMAGE_SIZE,
+    OBS_TYPES,
+    REWARD_LIFTED,
+    REWARD_PLACED,
+    Camera,
+)
+from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
+
+ROBOT_BASE = (-0.615, 0.0, 0.0)
+"""Robot base in metres: ManiSkill's own default."""
+
+WALL = 0.005
+"""Thickness of the bin's walls and floor, in metres (paper, section II)."""
+
+LIFT_HEIGHT = 0.15
+"""Height in metres that the object's centre must reach to count as lifted (paper, section III)."""
+
+RIM_ALLOWANCE = 0.025
+"""Added in metres to half the bin's height, so that an object resting on the rim counts (paper, section III)."""
+
+FINGER_OPEN = 0.038
+"""Position in metres at which a finger counts as open; its limit is 0.04, a held brick keeps it at 0.0325."""
+
+PLACED_STEPS = 5
+"""Consecutive steps inside the bin, gripper open, that make a placement (paper, section III)."""
+
+NO_DEVICE = ("vk::", "Vulkan", "rendering device", "physical device")
+"""Words of SAPIEN's errors where there is nothing to render with."""
+
+HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
+
+
+class PickPlaceEnv(BaseEnv):
+    """
+    **Task Description:**
+    Pick an object from the ground and place it in an open-topped bin. A task overrides `_load_object` and the
+    four geometry constants below.
+
+    **Randomizations:**
+    - The object's centre is uniform within `spawn_range` of `object_center` in x and y.
+    - Its yaw is uniform within `yaw_range` of zero; the default is a full turn.
+    Both come from the episode's own generator, so an episode does not depend on the batch it runs in.
+
+    **Success Conditions:**
+    - The object's centre is inside `placement_bounds` of the bin's centre and both fingers are open, for five
+      consecutive steps.
+
+    Args:
+        cameras: names of the cameras in `contract.CAMERAS` to observe with; the paper's sole view by default.
+        light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
+        render_backend: ManiSkill's, or "auto": the GPU if there is one, else Mesa's lavapipe.
+
+    Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
+    environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
+    """
+
+    SUPPORTED_ROBOTS = ["panda", LightPanda.uid]
+    SUPPORTED_REWARD_MODES = ("sparse", "none")
+
+    # The four geometry constants, in metres.
+    object_size = (0.21, 0.065, 0.10)
+    object_center = (0.0, 0.0)
+    bin_center = (0.0, -0.35)
+    bin_interior = (0.25, 0.20, 0.15)
+
+    # The initial-state distribution, in metres and radians.
+    spawn_range = 0.10
+    yaw_range = np.pi
+
+    def __init__(
+        self,
+        *args,
+        cameras: tuple[str, ...] = OBS_TYPES["pixels"],
+        light_robot: bool | None = None,
+        control_mode: str = "pd_ee_delta_pose",
+        render_backend: str = "auto",
+        **kwargs,
+    ):
+        if render_backend == "auto":
+            render_backend = "gpu" if torch.cuda.is_available() else "cpu"
+        self.cameras = tuple(cameras)
+        self.light_robot = render_backend in ("cpu", "sapien_cpu") if light_robot is None else light_robot
+        try:
+            super().__init__(
+                *args,
+                robot_uids=LightPanda.uid if self.light_robot else "panda",
+                control_mode=control_mode,
+                render_backend=render_backend,
+                sim_config={"control_freq": FPS},
+                **kwargs,
+            )
+        except RuntimeError as error:
+            if not any(
+                word in str(error).lower() for word in ("vk::", "vulkan", "rendering device", "physical device")
+            ):
+                raise
+            raise RuntimeError(
+                f"No Vulkan device to render with ({error}); `make setup` installs Mesa's software renderer and "
+                "`constructskill-doctor` tells what is missing."
+            ) from None
+
+    # What a task declares
+
+    def _load_object(self, builder: ActorBuilder) -> None:
+        """Give `builder` the object's collision shapes and visuals, centred at its origin, unrotated."""
+        raise NotImplementedError
+
+    # Scene
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        return [self._camera_config(CAMERAS[name]) for name in self.cameras]
+
+    def _camera_config(self, camera: Camera) -> CameraConfig:
+        if camera.mount is None:
+            view = {"pose": look_at(camera.eye, camera.target)}
+        else:  # looks along the hand's approach axis
+            pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
+            view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
+        return CameraConfig(camera.name, width=IMAGE_SIZE, height=IMAGE_SIZE, fov=camera.fov, **view)
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        pose = look_at([0.9, -1.0, 0.8], [-0.1, -0.15, 0.15])
+        return CameraConfig("render_camera", pose=pose, width=512, height=512, fov=0.9)
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, sapien.Pose(p=ROBOT_BASE))
+
+    def _load_scene(self, options: dict) -> None:
+        self._load_hall()
+        self.bin = self._load_bin()
+        builder = self.scene.create_actor_builder()
+        self._load_object(builder)
+        builder.initial_pose = sapien.Pose(p=[*self.object_center, self.object_size[2] / 2])
+        self.object = builder.build_dynamic(name="object")
+        self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._placed = torch.zeros_like(self._lifted)
+        self._last_unsettled = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+
+    def _load_hall(self) -> None:
+        """Ground plane, and the plastered walls of the building around it; the walls do not collide."""
+        builder = self.scene.create_actor_builder()
+        builder.add_plane_collision(sapien.Pose(q=euler2quat(0, -np.pi / 2, 0)))
+        if self.scene.can_render():
+            screed = textured(mottled((150, 146, 138), contrast=0.05, seed=1))
+            plaster = textured(mottled((222, 217, 206), contrast=0.02, seed=2))
+            w, h, t = HALL_HALF_WIDTH, HALL_HEIGHT / 2, 0.01
+            builder.add_box_visual(sapien.Pose([0, 0, -t]), [w, w, t], material=screed)
+            for side in (-w, w):
+                builder.add_box_visual(sapien.Pose([side, 0, h]), [t, w, h], material=plaster)
+                builder.add_box_visual(sapien.Pose([0, side, h]), [w, t, h], material=plaster)
+        builder.initial_pose = sapien.Pose()
+        builder.build_static(name="hall")
+
+    def _load_lighting(self, options: dict) -> None:
+        self.scene.set_ambient_light([0.5, 0.5, 0.5])
+        self.scene.add_directional_light([1, 1, -1], [0.9, 0.9, 0.9], shadow=self.enable_shadow)
+        self.scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
+
+    def _load_bin(self) -> Actor:
+        """A floor and four walls around `bin_interior`, standing on the ground."""
+        x, y, z = (extent / 2 for extent in self.bin_interior)
+        t = WALL / 2
+        panels = [([0, 0, -z - t], [x + WALL, y + WALL, t])]
+        panels += [([side * (x + t), 0, 0], [t, y + WALL, z]) for side in (-1, 1)]
+        panels += [([0, side * (y + t), 0], [x, t, z]) for side in (-1, 1)]
+        builder = self.scene.create_actor_builder()
+        for center, half_size in panels:
+            builder.add_box_collision(sapien.Pose(center), half_size)
+            builder.add_box_visual(sapien.Pose(center), half_size, material=(0.10, 0.22, 0.42))
+        builder.initial_pose = sapien.Pose(p=self.bin_position)
+        return builder.build_kinematic(name="bin")
+
+    # Initial state
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+        with torch.device(self.device):
+            self.agent.reset(self.agent.keyframes["rest"].qpos)
+            self.agent.robot.set_pose(sapien.Pose(p=ROBOT_BASE))
+            offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
+            offsets = offsets.to(self.device)
+            position = torch.tensor([*self.object_center, self.object_size[2] / 2]).repeat(len(env_idx), 1)
+            position[:, :2] += offsets[:, :2]
+            half_yaw = offsets[:, 2] / 2
+            zero = torch.zeros_like(half_yaw)
+            quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
+            self.object.set_pose(Pose.create_from_pq(position, quaternion))
+            self._lifted[env_idx] = False
+            self._placed[env_idx] = False
+            self._last_unsettled[env_idx] = 0
+
+    def _spawn_offsets(self, rng: BatchedRNG) -> np.ndarray:
+        """One row (dx, dy, dyaw) per episode generator in `rng`, in metres and radians."""
+        scale = np.array([self.spawn_range, self.spawn_range, self.yaw_range])
+        return np.reshape(rng.uniform(-1, 1, size=3), (-1, 3)) * scale
+
+    # Success
+
+    @property
+    def bin_position(self) -> tuple[float, float, float]:
+        """Centre of the bin's interior, in metres."""
+        return (*self.bin_center, WALL + self.bin_interior[2] / 2)
+
+    @property
+    def placement_bounds(self) -> tuple[float, float, float]:
+        """Largest distance in x, y and z between the object's and the bin's centre, in metres."""
+        x, y, z = (extent / 2 for extent in self.bin_interior)
+        return (x, y, z + RIM_ALLOWANCE)
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Named booleans of shape (num_envs,); calling it twice in one step changes nothing."""
+        center = self.object.pose.p
+        offset = (center - self.bin.pose.p).abs()
+        is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
+        is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
+        self._lifted |= center[:, 2] >= LIFT_HEIGHT
+        settled = is_in_bin & is_gripper_open
+        self._last_unsettled = torch.where(settled, self._last_unsettled, self.elapsed_steps)
+        self._placed |= self.elapsed_steps - self._last_unsettled >= PLACED_STEPS
+        return {
+            "is_lifted": self._lifted.clone(),
+            "is_in_bin": is_in_bin,
+            "is_gripper_open": is_gripper_open,
+            "is_placed": self._placed.clone(),
+            "success": self._placed.clone(),
+        }
+
+    def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """The stage reached, of shape (num_envs,)."""
+        reached = torch.where(info["is_placed"], REWARD_PLACED, 0.0)
+        return torch.where(info["is_lifted"], reached.clamp(min=REWARD_LIFTED), reached)
+
+    # Observations
+
+    def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
+        extra = {"tcp_pose": self.agent.tcp.pose.raw_pose}
+        if "state" in self.obs_mode:
+            extra |= {"object_pose": self.object.pose.raw_pose, "bin_position": self.bin.pose.p}
+        return extra
+
+    @property
+    def object_mass(self) -> float:
+        """In kilograms."""
+        return float(self.object.mass[0])
+
+    def agent_state(self) -> torch.Tensor:
+        """Proprioception as `contract.STATE_NAMES` names it, (num_envs, 8), in the robot's base frame.
+
+        The gripper points down, half a turn about x, where the usual axis-angle jumps between +pi and -pi; the
+        sign of the quaternion is chosen so that the x component stays positive and continuous there.
+        """
+        tcp = self.agent.robot.pose.inv() * self.agent.tcp.pose
+        rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q))
+        return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
+
+    def privileged_state(self) -> dict[str, torch.Tensor]:
+        """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
+        constants = {
+            "object_size": self.object_size,
+            "object_mass": [self.object_mass],
+            "bin_interior": self.bin_interior,
+        }
+        state = {
+            "tcp_pose": self.agent.tcp.pose.raw_pose,
+            "fingers": self.agent.robot.get_qpos()[:, -2:],
+            "object_pose": self.object.pose.raw_pose,
+            "bin_position": self.bin.pose.p,
+        }
+        for name, value in constants.items():
+            state[name] = torch.tensor(value, device=self.device).expand(self.num_envs, -1)
+        return state

@@ -1,0 +1,127 @@
+"""What the scene looks like: the Panda's light-weight visual meshes and the procedural textures.
+
+Without a GPU a frame's cost is the Panda's 135,000 triangles, so the meshes are decimated once and cached.
+Collision meshes are the original files: physics does not know which robot is drawn.
+"""
+
+import hashlib
+import os
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import sapien.render
+import trimesh
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots import Panda
+from PIL import Image
+
+LIGHT_TRIANGLES = 4_000
+"""Triangles of the whole light robot; at 224 x 224 pixels the mean difference is under 0.5/255."""
+
+_MIN_TRIANGLES_PER_PART = 12
+_CREASE_ANGLE = np.radians(40)
+
+
+def cache_folder() -> Path:
+    """Folder for files that can be made again: `$XDG_CACHE_HOME/constructskill`, or the same under `~/.cache`."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "constructskill"
+
+
+def light_panda_urdf() -> str:
+    """Path of a Panda URDF whose visual meshes have `LIGHT_TRIANGLES` triangles; made on first use.
+
+    Safe for several processes at once: the folder appears whole, by a rename, or not at all.
+    """
+    source = Path(Panda.urdf_path)
+    key = hashlib.sha256(f"{LIGHT_TRIANGLES} {_CREASE_ANGLE} {source}".encode() + source.read_bytes()).hexdigest()[:16]
+    folder = cache_folder() / f"panda_light_{key}"
+    if not folder.exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+            built = Path(scratch) / "panda"
+            _build_light_panda(source, built)
+            try:
+                built.rename(folder)
+            except OSError:  # another process was first
+                if not folder.exists():
+                    raise
+    return str(folder / source.name)
+
+
+def _build_light_panda(source: Path, folder: Path) -> None:
+    folder.mkdir()
+    tree = ET.parse(source)
+    visuals = [mesh for visual in tree.iter("visual") for mesh in visual.iter("mesh")]
+    names = sorted({mesh.attrib["filename"] for mesh in visuals})
+    scenes = {name: trimesh.load_scene(source.parent / name) for name in names}
+    total = sum(len(part.faces) for scene in scenes.values() for part in scene.geometry.values())
+    for name, scene in scenes.items():
+        _decimate(scene, LIGHT_TRIANGLES / total)
+        scene.export(folder / Path(name).name)
+    for mesh in tree.iter("mesh"):
+        name = mesh.attrib["filename"]
+        light = mesh in visuals
+        mesh.attrib["filename"] = str(Path(name).name if light else source.parent / name)
+    tree.write(folder / source.name)
+
+
+def _decimate(scene: trimesh.Scene, fraction: float) -> None:
+    """Reduce every part of `scene` in place to `fraction` of its triangles; colours stay."""
+    for name, part in scene.geometry.items():
+        material = part.visual.material
+        # The files split vertices at every crease; decimation needs the surface in one piece.
+        part.merge_vertices(merge_tex=True, merge_norm=True)
+        target = max(_MIN_TRIANGLES_PER_PART, int(len(part.faces) * fraction))
+        light = trimesh.graph.smooth_shade(part.simplify_quadric_decimation(face_count=target), angle=_CREASE_ANGLE)
+        light.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.geometry[name] = light
+
+
+@register_agent()
+class LightPanda(Panda):
+    """ManiSkill's Panda, drawn with a few thousand triangles. Same links, collisions and controllers."""
+
+    uid = "constructskill_panda_light"
+
+    @property
+    def urdf_path(self) -> str:
+        return light_panda_urdf()
+
+
+def textured(image: np.ndarray, roughness: float = 0.9) -> sapien.render.RenderMaterial:
+    """A matt material that shows `image`, an (H, W, 3) uint8 array."""
+    rgba = np.concatenate([image, np.full((*image.shape[:2], 1), 255, np.uint8)], axis=-1)
+    material = sapien.render.RenderMaterial(roughness=roughness, metallic=0.0, specular=0.1)
+    material.base_color_texture = sapien.render.RenderTexture2D(rgba, "R8G8B8A8Unorm", mipmap_levels=4, srgb=True)
+    return material
+
+
+def mottled(colour: tuple[int, int, int], contrast: float, size: int = 256, seed: int = 0) -> np.ndarray:
+    """A mineral surface of mean `colour`: soft blotches and fine grain, (size, size, 3) uint8.
+
+    Args:
+        colour: mean RGB, 0 to 255.
+        contrast: standard deviation of the brightness, as a fraction of the colour.
+    """
+    rng = np.random.default_rng(seed)
+    brightness = np.zeros((size, size))
+    for cells in (8, 32, 128):
+        coarse = Image.fromarray(rng.standard_normal((cells, cells)).astype(np.float32))
+        brightness += np.asarray(coarse.resize((size, size), Image.Resampling.BICUBIC))
+    brightness *= contrast / brightness.std()
+    return np.clip(np.array(colour) * (1 + brightness[..., None]), 0, 255).astype(np.uint8)
+
+
+def perforated(image: np.ndarray, rows: int, columns: int, radius: float) -> np.ndarray:
+    """`image` with a grid of dark round holes, as on the bed face of a brick.
+
+    Args:
+        radius: of a hole, as a fraction of the spacing between holes.
+    """
+    height, width = image.shape[:2]
+    y = (np.arange(height)[:, None] + 0.5) * rows / height % 1 - 0.5
+    x = (np.arange(width)[None, :] + 0.5) * columns / width % 1 - 0.5
+    holes = np.hypot(x, y) < radius
+    return np.where(holes[..., None], image // 4, image)

@@ -1,0 +1,165 @@
+"""What every registered task owes, checked on the real simulator and renderer."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.utils.structs import Pose
+
+import lerobot_constructskill.sim.register  # noqa: F401
+from lerobot_constructskill.contract import IMAGE_SIZE, SIM_STATE, TASKS
+from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
+
+pytestmark = pytest.mark.sim
+
+HOLD_OPEN = np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32)
+HOLD_CLOSED = np.array([0, 0, 0, 0, 0, 0, -1], dtype=np.float32)
+
+
+def make(task, **kwargs):
+    kwargs = {"obs_mode": "none", "render_backend": "none"} | kwargs
+    return gym.make(TASKS[task].env_id, **kwargs).unwrapped
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def blind(request):
+    """An environment of each task that renders nothing."""
+    env = make(request.param)
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def seeing(request):
+    env = make(request.param, obs_mode="rgb", render_backend="auto", cameras=("base", "wrist"))
+    yield env
+    env.close()
+
+
+def trajectory(env, seed, steps=12):
+    rng = np.random.default_rng(seed)
+    env.reset(seed=seed)
+    states = []
+    for _ in range(steps):
+        env.step(rng.uniform(-1, 1, 7).astype(np.float32))
+        states.append(torch.cat(list(env.privileged_state().values()), dim=-1))
+    return torch.cat(states)
+
+
+def move_object(env, position):
+    env.object.set_pose(Pose.create_from_pq(torch.tensor([position]), torch.tensor([[1.0, 0, 0, 0]])))
+    env.object.set_linear_velocity(torch.zeros(3))
+    env.object.set_angular_velocity(torch.zeros(3))
+
+
+def test_every_camera_shows_a_picture_and_the_objects_in_it(seeing):
+    obs, _ = seeing.reset(seed=0)
+    for camera in ("base", "wrist"):
+        rgb = obs["sensor_data"][camera]["rgb"]
+        assert rgb.shape == (1, IMAGE_SIZE, IMAGE_SIZE, 3) and rgb.dtype == torch.uint8
+        assert rgb.float().std() > 10
+    with_object = obs["sensor_data"]["base"]["rgb"].int()
+    move_object(seeing, [-2.0, -2.0, 0.1])
+    without = seeing.get_obs()["sensor_data"]["base"]["rgb"].int()
+    assert ((with_object - without).abs().sum(-1) > 30).sum() > 20
+
+
+def test_equal_seeds_and_actions_give_equal_trajectories(blind):
+    first = trajectory(blind, seed=5)
+    trajectory(blind, seed=6)
+    assert torch.equal(first, trajectory(blind, seed=5))
+    assert torch.isfinite(first).all()
+
+
+def test_initial_states_vary_exactly_where_the_task_says_so(blind):
+    poses = []
+    for seed in range(8):
+        blind.reset(seed=seed)
+        poses.append(blind.object.pose.p[0].numpy().copy())
+    offsets = np.array(poses)[:, :2] - blind.object_center
+    assert np.abs(offsets).max() <= blind.spawn_range + 1e-6
+    assert (np.ptp(offsets, axis=0) > blind.spawn_range / 2).all() or blind.spawn_range == 0
+
+
+def test_an_episode_does_not_depend_on_its_batch():
+    draw = PickPlaceEnv._spawn_offsets
+    batch = draw(PickPlaceEnv, BatchedRNG.from_seeds([3, 4, 5], backend="numpy:random_state"))
+    alone = draw(PickPlaceEnv, BatchedRNG.from_seeds([4], backend="numpy:random_state"))
+    np.testing.assert_array_equal(batch[1:2], alone)
+
+
+def test_the_shared_class_randomises_position_and_a_full_turn_of_yaw():
+    rng = BatchedRNG.from_seeds(list(range(400)), backend="numpy:random_state")
+    offsets = PickPlaceEnv._spawn_offsets(PickPlaceEnv, rng)
+    np.testing.assert_allclose(np.abs(offsets).max(axis=0), [0.10, 0.10, np.pi], rtol=0.05)
+    np.testing.assert_allclose(offsets.mean(axis=0), 0, atol=0.25)
+
+
+def test_the_papers_bounds_follow_from_the_bins_geometry():
+    env = make("brick_to_bin")
+    assert env.placement_bounds == pytest.approx((0.125, 0.10, 0.10))
+    assert env.object_size == (0.21, 0.065, 0.10)
+
+
+def test_placement_takes_five_consecutive_steps_with_the_gripper_open(blind):
+    blind.reset(seed=0)
+    inside = [*blind.bin_center, 0.005 + blind.object_size[2] / 2]
+    move_object(blind, inside)
+    for _ in range(PLACED_STEPS - 1):
+        *_, info = blind.step(HOLD_OPEN)
+        assert info["is_in_bin"] and info["is_gripper_open"] and not info["is_placed"]
+    move_object(blind, [0.3, 0.0, blind.object_size[2] / 2])
+    *_, info = blind.step(HOLD_OPEN)
+    assert not info["is_in_bin"] and not info["success"]
+    move_object(blind, inside)
+    placed = [bool(blind.step(HOLD_OPEN)[-1]["success"]) for _ in range(PLACED_STEPS)]
+    assert placed == [False] * (PLACED_STEPS - 1) + [True]
+
+
+def test_a_closed_gripper_is_no_placement(blind):
+    blind.reset(seed=0)
+    for _ in range(PLACED_STEPS):
+        blind.step(HOLD_CLOSED)
+    move_object(blind, [*blind.bin_center, 0.005 + blind.object_size[2] / 2])
+    for _ in range(2 * PLACED_STEPS):
+        *_, info = blind.step(HOLD_CLOSED)
+    assert info["is_in_bin"] and not info["is_gripper_open"] and not info["success"]
+
+
+def test_asking_twice_changes_no_outcome(blind):
+    blind.reset(seed=0)
+    move_object(blind, [*blind.bin_center, 0.005 + blind.object_size[2] / 2])
+    for _ in range(PLACED_STEPS - 1):
+        blind.step(HOLD_OPEN)
+        first, second = blind.evaluate(), blind.evaluate()
+        assert all(torch.equal(first[name], second[name]) for name in first)
+    assert not first["success"]
+
+
+def test_lifted_holds_for_the_rest_of_the_episode_and_not_for_the_next(blind):
+    blind.reset(seed=0)
+    move_object(blind, [0.3, 0.3, 0.4])
+    _, reward, *_ = blind.step(HOLD_OPEN)
+    move_object(blind, [0.3, 0.3, 0.05])
+    *_, info = blind.step(HOLD_OPEN)
+    assert info["is_lifted"] and reward.shape == (1,)
+    _, info = blind.reset(seed=0)
+    assert not info["is_lifted"]
+
+
+def test_privileged_state_is_what_the_contract_says(blind):
+    blind.reset(seed=0)
+    state = blind.privileged_state()
+    assert {name: value.shape for name, value in state.items()} == {
+        name: (1, length) for name, length in SIM_STATE.items()
+    }
+
+
+def test_the_light_robot_moves_as_the_original_and_looks_like_it():
+    options = {"obs_mode": "rgb", "render_backend": "auto"}
+    light = make("brick_to_bin", light_robot=True, **options)
+    original = make("brick_to_bin", light_robot=False, **options)
+    torch.testing.assert_close(trajectory(light, seed=1), trajectory(original, seed=1), rtol=0, atol=1e-4)
+    frames = [env.get_obs()["sensor_data"]["base"]["rgb"].float() for env in (light, original)]
+    assert (frames[0] - frames[1]).abs().mean() < 1.0
