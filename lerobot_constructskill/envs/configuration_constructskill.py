@@ -1,0 +1,75 @@
+"""`--env.type=constructskill`."""
+
+import multiprocessing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, get_task
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+
+@EnvConfig.register_subclass("constructskill")
+@dataclass
+class ConstructSkillEnvConfig(EnvConfig):
+    """ConstructSkill's tasks for `lerobot-train` and `lerobot-eval`.
+
+    Args:
+        task: a name in `contract.TASKS`.
+        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the 8-number
+            state, for policies that need them).
+        episode_length: horizon of an evaluation episode in steps; the task's own by default.
+        light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
+            Training and evaluation should see the same robot.
+        render_backend: "auto", or ManiSkill's "gpu" or "cpu".
+    """
+
+    task: str = "brick_to_bin"
+    fps: int = FPS
+    obs_type: str = "pixels"
+    episode_length: int | None = None
+    light_robot: bool | None = None
+    render_backend: str = "auto"
+
+    def __post_init__(self):
+        if self.max_parallel_tasks != 1:
+            raise ValueError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+        row = get_task(self.task)
+        self._make_env()  # refuses what no environment can be made with
+        self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(row.action_names),))}
+        self.features_map = {"action": "action"}
+        for name in OBS_TYPES[self.obs_type]:
+            key = CAMERAS[name].key
+            self.features[key] = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))
+            self.features_map[key] = key
+        if self.obs_type == "pixels_agent_pos":
+            self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
+            self.features_map["agent_pos"] = "observation.state"
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        names = ("task", "obs_type", "episode_length", "light_robot", "render_backend")
+        return {name: getattr(self, name) for name in names}
+
+    def _make_env(self) -> ConstructSkillEnv:
+        return ConstructSkillEnv(**self.gym_kwargs)
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """`{"constructskill": {0: vector environment}}`; every sub-environment freezes after its episode's end."""
+        env_fns = [partial(ConstructSkillEnv, **self.gym_kwargs) for _ in range(n_envs)]
+        if use_async_envs and n_envs > 1:
+            # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.
+            multiprocessing.set_forkserver_preload(["lerobot.envs.utils", "lerobot_constructskill.sim.register"])
+            probe = self._make_env()
+            vector = _LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
+        else:
+            vector = gym.vector.SyncVectorEnv(
+                [freeze_after_episode_end(fn) for fn in env_fns],
+                autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
+            )
+        return {self.type: {0: vector}}

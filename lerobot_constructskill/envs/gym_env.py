@@ -1,0 +1,183 @@
+"""One brick-task environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from lerobot_constructskill.contract import (
+    ACTION_SCALE,
+    CAMERAS,
+    FPS,
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    IMAGE_SIZE,
+    OBS_TYPES,
+    STATE_NAMES,
+    get_task,
+)
+
+MANISKILL_CHANNELS = ("dx", "dy", "dz", "drx", "dry", "dyaw", "gripper")
+"""The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
+
+
+class ConstructSkillEnv(gym.Env):
+    """A task of the contract table for LeRobot's scripts, or for any Gymnasium user.
+
+    Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
+    `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres and the
+    gripper, +1 open, -1 closed, float32; translations beyond 0.1 m are clipped. The reward is the stage reached:
+    0, 0.5 once lifted, 1 once placed. `info` holds `is_success` and the named booleans of the scene, from the
+    first reset on.
+
+    Non-obvious behaviours: the simulator is born on the first `reset`, in the process that calls it, so
+    constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
+
+    Args:
+        task: a name in `contract.TASKS`.
+        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the state).
+        episode_length: steps after which an episode is truncated; the task's horizon by default.
+        light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
+        render_backend: ManiSkill's, or "auto": the GPU if there is one, else the CPU.
+
+    Raises:
+        ValueError: no such task or obs_type, or an episode_length below 1.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        task: str = "brick_to_bin",
+        obs_type: str = "pixels",
+        episode_length: int | None = None,
+        light_robot: bool | None = None,
+        render_backend: str = "auto",
+    ):
+        self._row = get_task(task)
+        if obs_type not in OBS_TYPES:
+            raise ValueError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
+        if episode_length is not None and episode_length < 1:
+            raise ValueError(f"episode_length must be at least 1 step, not {episode_length}.")
+        self.task = task
+        self.task_description = self._row.instruction
+        self.obs_type = obs_type
+        self._max_episode_steps = episode_length or self._row.horizon
+        self._scene_kwargs = {
+            "cameras": OBS_TYPES[obs_type],
+            "light_robot": light_robot,
+            "render_backend": render_backend,
+        }
+        self._env = None
+        self._steps = 0
+        self.observation_space = self._make_observation_space()
+        self.action_space = self._make_action_space()
+
+    def _make_observation_space(self) -> spaces.Dict:
+        image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        space = {"pixels": spaces.Dict(dict.fromkeys(OBS_TYPES[self.obs_type], image))}
+        if self.obs_type == "pixels_agent_pos":
+            space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
+        return spaces.Dict(space)
+
+    def _make_action_space(self) -> spaces.Box:
+        high = np.full(len(self._row.action_names), ACTION_SCALE, dtype=np.float32)
+        high[-1] = GRIPPER_OPEN
+        low = -high
+        low[-1] = GRIPPER_CLOSED
+        return spaces.Box(low, high, dtype=np.float32)
+
+    # Gymnasium
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode whose initial state is a function of `seed` alone; unknown `options` are ignored."""
+        super().reset(seed=seed)
+        if seed is None:
+            seed = int(self.np_random.integers(2**31))
+        self._steps = 0
+        obs, info = self._ensure_env().reset(seed=seed)
+        return self._observation(obs), self._info(info)
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Advance 1/20 s.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+            ValueError: an action of another shape, or not finite.
+        """
+        if self._env is None:
+            raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
+        obs, reward, terminated, _, info = self._env.step(self._maniskill_action(action))
+        self._steps += 1
+        truncated = self._steps >= self._max_episode_steps
+        return self._observation(obs), float(reward[0]), bool(terminated[0]), truncated, self._info(info)
+
+    def render(self) -> np.ndarray:
+        """A close-up of the scene, (H, W, 3) uint8."""
+        return self._ensure_env().render()[0].cpu().numpy()
+
+    def close(self) -> None:
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    # For experts and recorders
+
+    def privileged_state(self) -> dict[str, np.ndarray]:
+        """The simulator's state, `contract.SIM_STATE` name to float32 array."""
+        state = self._ensure_env().unwrapped.privileged_state()
+        return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
+
+    def agent_state(self) -> np.ndarray:
+        """Proprioception as `contract.STATE_NAMES` names it, (8,) float32."""
+        return self._ensure_env().unwrapped.agent_state()[0].cpu().numpy().astype(np.float32)
+
+    @property
+    def light_robot(self) -> bool:
+        """Whether the robot is drawn with decimated meshes."""
+        return self._ensure_env().unwrapped.light_robot
+
+    # ManiSkill
+
+    def _ensure_env(self) -> gym.Env:
+        if self._env is None:
+            import lerobot_constructskill.sim.register  # noqa: F401
+
+            self._env = gym.make(
+                self._row.env_id,
+                obs_mode="rgb",
+                reward_mode="sparse",
+                render_mode="rgb_array",
+                max_episode_steps=None,
+                disable_env_checker=True,
+                **self._scene_kwargs,
+            ).unwrapped
+        return self._env
+
+    def _maniskill_action(self, action: np.ndarray) -> np.ndarray:
+        action = np.asarray(action, dtype=np.float32)
+        names = self._row.action_names
+        if action.shape != (len(names),) or not np.isfinite(action).all():
+            raise ValueError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
+        scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
+        for name, value in zip(names, action, strict=True):
+            scaled[MANISKILL_CHANNELS.index(name)] = value if name == "gripper" else value / ACTION_SCALE
+        return np.clip(scaled, -1, 1)
+
+    def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
+        cameras = OBS_TYPES[self.obs_type]
+        pixels = {name: obs["sensor_data"][name]["rgb"][0].cpu().numpy() for name in cameras}
+        if self.obs_type == "pixels":
+            return {"pixels": pixels}
+        return {"pixels": pixels, "agent_pos": self.agent_state()}
+
+    def _info(self, info: dict[str, Any]) -> dict[str, Any]:
+        booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
+        return {"is_success": bool(info["success"][0]), **booleans}
+
+
+assert all(camera in CAMERAS for cameras in OBS_TYPES.values() for camera in cameras)

@@ -1,0 +1,189 @@
+"""The environment as Gymnasium and LeRobot see it."""
+
+import os
+import subprocess
+import sys
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from lerobot.envs.utils import (
+    check_env_attributes_and_types,
+    env_to_policy_features,
+    preprocess_observation,
+)
+
+from lerobot_constructskill.contract import ACTION_SCALE, IMAGE_SIZE, OBS_TYPES, TASKS
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+HOVER = np.array([0, 0, 0, 1], dtype=np.float32)
+UP_CLOSED = np.array([0.02, -0.01, 0.05, -1], dtype=np.float32)
+NEW_ROLLOUT = {"lerobot_new_rollout": True}
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = ConstructSkillEnv(obs_type="pixels_agent_pos", episode_length=6)
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize("field, value", [("task", "brick"), ("obs_type", "state"), ("episode_length", 0)])
+@pytest.mark.parametrize("build", [ConstructSkillEnv, ConstructSkillEnvConfig])
+def test_bad_fields_are_refused_in_one_sentence(build, field, value):
+    with pytest.raises(ValueError, match=str(value)) as refused:
+        build(**{field: value})
+    assert "\n" not in str(refused.value)
+
+
+def test_parallel_tasks_are_refused():
+    with pytest.raises(ValueError, match="max_parallel_tasks"):
+        ConstructSkillEnvConfig(max_parallel_tasks=2)
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("obs_type", OBS_TYPES)
+def test_config_and_environment_declare_the_same_features(task, obs_type):
+    config = ConstructSkillEnvConfig(task=task, obs_type=obs_type)
+    env = ConstructSkillEnv(**config.gym_kwargs)
+    features = env_to_policy_features(config)
+    cameras = {f"observation.images.{name}" for name in env.observation_space["pixels"]}
+    assert {name for name in features if "images" in name} == cameras
+    assert features["action"].shape == env.action_space.shape
+    assert ("observation.state" in features) == ("agent_pos" in env.observation_space.spaces)
+    assert env.task_description == TASKS[task].instruction
+    assert env._max_episode_steps == TASKS[task].horizon
+    config.__post_init__()
+    assert env_to_policy_features(config) == features
+
+
+def test_stepping_before_the_first_reset_is_refused():
+    with pytest.raises(RuntimeError, match="reset"):
+        ConstructSkillEnv().step(HOVER)
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
+def test_gymnasiums_own_check_passes(env):
+    check_env(env)
+
+
+@pytest.mark.sim
+def test_success_is_in_every_info_and_the_end_is_a_truncation(env):
+    _, info = env.reset(seed=0)
+    assert info["is_success"] is False
+    for step in range(6):
+        _, reward, terminated, truncated, info = env.step(HOVER)
+        assert (reward, terminated, info["is_success"]) == (0.0, False, False)
+        assert truncated == (step == 5)
+
+
+@pytest.mark.sim
+def test_equal_seeds_give_equal_episodes_and_images(env):
+    def run():
+        frames = [env.reset(seed=3)[0]]
+        frames += [env.step(UP_CLOSED)[0] for _ in range(4)]
+        return frames
+
+    for first, second in zip(run(), run(), strict=True):
+        np.testing.assert_array_equal(first["agent_pos"], second["agent_pos"])
+        for name in OBS_TYPES["pixels_agent_pos"]:
+            np.testing.assert_array_equal(first["pixels"][name], second["pixels"][name])
+
+
+@pytest.mark.sim
+def test_actions_are_metres_in_the_base_frame(env):
+    env.reset(seed=0)
+    before = env.agent_state()
+    for _ in range(6):
+        env.step(np.array([0.02, 0, 0.02, 1], dtype=np.float32))
+    moved = env.agent_state()[:3] - before[:3]
+    # the PD spring covers a good third of what is asked for in each step
+    assert 0.2 * 0.12 < moved[0] < 0.12 and 0.2 * 0.12 < moved[2] < 0.12 and abs(moved[1]) < 0.01
+
+
+@pytest.mark.sim
+def test_no_element_of_the_state_is_constant_over_an_episode(env):
+    states = [env.reset(seed=0)[0]["agent_pos"]]
+    for step in range(6):
+        sign = 1 if step < 3 else -1
+        states.append(env.step(np.array([0.05 * sign, 0.05, 0.05, -sign]))[0]["agent_pos"])
+    assert (np.ptp(states, axis=0) > 0).all()
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("action", [np.zeros(7), np.zeros((1, 4)), np.array([0, 0, np.nan, 1])])
+def test_bad_actions_are_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="4 finite numbers"):
+        env.step(action)
+
+
+@pytest.mark.sim
+def test_translations_are_clipped_not_rescaled(env):
+    def reach(dx):
+        env.reset(seed=0)
+        env.step(np.array([dx, 0, 0, 1], dtype=np.float32))
+        return env.agent_state()
+
+    np.testing.assert_array_equal(reach(ACTION_SCALE), reach(3 * ACTION_SCALE))
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_vector_environments_follow_lerobots_contract(use_async_envs):
+    config = ConstructSkillEnvConfig(obs_type="pixels_agent_pos", episode_length=3)
+    vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
+    try:
+        obs, _ = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        if not use_async_envs:
+            check_env_attributes_and_types(vector)
+        assert list(vector.call("_max_episode_steps")) == [3, 3]
+        assert vector.unwrapped.metadata["render_fps"] == config.fps
+        batch = preprocess_observation(obs)
+        assert batch["observation.images.base"].shape == (2, 3, IMAGE_SIZE, IMAGE_SIZE)
+        assert batch["observation.state"].shape == (2, 8)
+        assert list(vector.call("task_description")) == [TASKS[config.task].instruction] * 2
+
+        for _ in range(3):
+            frozen, _, _, truncated, info = vector.step(np.stack([UP_CLOSED, UP_CLOSED]))
+            assert info["is_success"].shape == (2,)
+        assert truncated.all()
+        for _ in range(2):  # after its end an episode stands still, whatever is asked for
+            after, reward, *_ = vector.step(np.stack([HOVER, HOVER]))
+            np.testing.assert_array_equal(after["agent_pos"], frozen["agent_pos"])
+            assert (reward == 0).all()
+        again, _ = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
+    finally:
+        vector.close()
+
+
+@pytest.mark.sim
+def test_batched_and_single_episodes_are_equal():
+    make = partial(ConstructSkillEnv, task="block_to_bin")
+    vector = gym.vector.SyncVectorEnv([make, make])
+    single = make()
+    try:
+        obs, _ = vector.reset(seed=[11, 12])
+        alone, _ = single.reset(seed=12)
+        np.testing.assert_array_equal(obs["pixels"]["base"][1], alone["pixels"]["base"])
+    finally:
+        vector.close()
+        single.close()
+
+
+def test_a_machine_without_a_vulkan_device_is_told_so_in_one_sentence():
+    code = "from lerobot_constructskill.envs.gym_env import ConstructSkillEnv as E; E().reset()"
+    nowhere = {
+        "VK_DRIVER_FILES": "/nonexistent",
+        "VK_ICD_FILENAMES": "/nonexistent",
+        "CUDA_VISIBLE_DEVICES": "",
+    }
+    run = subprocess.run([sys.executable, "-c", code], env=os.environ | nowhere, capture_output=True, text=True)
+    assert run.returncode != 0
+    last = run.stderr.strip().splitlines()[-1]
+    assert "No Vulkan device" in last and "make setup" in last
