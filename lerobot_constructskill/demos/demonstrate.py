@@ -1,0 +1,50 @@
+"""One demonstration: an expert drives an environment through noise, and every frame is kept."""
+
+from typing import Any
+
+import numpy as np
+
+from lerobot_constructskill.contract import CAMERAS
+from lerobot_constructskill.demos.expert import Expert, PrivilegedState
+from lerobot_constructskill.demos.noise import NoiseConfig, execute
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+
+def demonstrate(
+    env: ConstructSkillEnv, expert: Expert, noise: NoiseConfig, seed: int
+) -> tuple[list[dict[str, Any]], bool]:
+    """Run one attempt from the initial state of `seed`, whose noise is a function of `seed` too.
+
+    Returns:
+        The frames, in the columns of `columns.demonstration_features`, and whether the object was placed. A frame
+        holds the observation before its action, and the reward and outcome after it.
+    """
+    rng = np.random.default_rng(seed)
+    obs, _ = env.reset(seed=seed)
+    sim = env.privileged_state()
+    progress = expert.start(PrivilegedState(**sim))
+    frames, success, truncated = [], False, False
+    while progress is not None and not (success or truncated):
+        clean, phase, progress = expert.act(PrivilegedState(**sim), progress)
+        executed = execute(clean, phase, noise, rng)
+        before = {
+            **{CAMERAS[name].key: image for name, image in obs["pixels"].items()},
+            "observation.state": env.agent_state(),
+            **{f"sim.{name}": value for name, value in sim.items()},
+        }
+        obs, reward, success, truncated, _ = env.step(executed)
+        sim = env.privileged_state()
+        frames.append(
+            before
+            | {
+                "action": clean,
+                "dart.executed_action": executed,
+                "dart.noise": executed[:3] - clean[:3],
+                "phase": str(phase),
+                "sim.seed": np.array([seed], dtype=np.int64),
+                "next.reward": np.array([reward], dtype=np.float32),
+                "next.success": np.array([success]),
+                "next.done": np.array([success or truncated or progress is None]),
+            }
+        )
+    return frames, success

@@ -1,0 +1,129 @@
+"""What a scripted expert is: a pure function of privileged state and of its own progress. It never holds the env."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from importlib import import_module
+from typing import Protocol
+
+import numpy as np
+
+from lerobot_constructskill.contract import Task
+
+
+class Phase(StrEnum):
+    """The six phases of a demonstration, in order (paper, section II)."""
+
+    PREGRASP = "PREGRASP"
+    DESCEND = "DESCEND"
+    GRASP = "GRASP"
+    LIFT = "LIFT"
+    CARRY = "CARRY"
+    RELEASE = "RELEASE"
+
+
+@dataclass(frozen=True)
+class PrivilegedState:
+    """The simulator's state as `contract.SIM_STATE` names it: float arrays, SI units, world frame."""
+
+    tcp_pose: np.ndarray
+    fingers: np.ndarray
+    object_pose: np.ndarray
+    object_size: np.ndarray
+    object_mass: np.ndarray
+    bin_position: np.ndarray
+    bin_interior: np.ndarray
+
+    @property
+    def tcp(self) -> np.ndarray:
+        """Position of the point between the finger tips, (3,)."""
+        return self.tcp_pose[:3]
+
+    @property
+    def jaw_axis(self) -> np.ndarray:
+        """Unit vector along which the fingers close, (3,): the y axis of the end effector."""
+        w, x, y, z = self.tcp_pose[3:]
+        return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far an expert has come.
+
+    Args:
+        phase: the phase of the next action.
+        steps: actions already issued in that phase.
+        anchor: position of the end effector when the phase began, (3,) metres.
+    """
+
+    phase: Phase
+    steps: int
+    anchor: np.ndarray
+
+    def step(self) -> "Progress":
+        return replace(self, steps=self.steps + 1)
+
+
+@dataclass(frozen=True)
+class ExpertConfig:
+    """Gains, thresholds and dwells of a scripted expert.
+
+    Args:
+        gain: proportional gain, metres asked for per metre of error.
+        max_step: largest translation asked for per axis and step while the jaws are empty, in metres.
+        load_max_step: the same in LIFT and CARRY. `pd_ee_delta_pose` is a spring from the current pose, whose
+            orientation sags the longer an object is held, so a loaded arm should not be slow.
+        compliance: translation asked for per newton of held weight, in m/N, which keeps that spring from sinking.
+        threshold: distance to a phase's target at which the phase ends, in metres.
+        align_tolerance: distance along the jaws within which DESCEND goes below the object's top, in metres.
+        grasp_dwell: steps spent closing the gripper.
+        release_dwell: longest time spent above the bin with the gripper open, in steps.
+        pregrasp_clearance: height above the grasp at which PREGRASP ends, in metres.
+        lift_height: how far LIFT rises, in metres (paper, section II).
+        release_clearance: gap between the object and the bin's rim at RELEASE, in metres.
+        finger_depth: how far below the object's top the finger tips grasp, in metres.
+
+    Raises:
+        ValueError: a value that no demonstration can be made with.
+    """
+
+    gain: float = 1.0
+    max_step: float = 0.03
+    load_max_step: float = 0.04
+    compliance: float = 0.001
+    threshold: float = 0.02
+    align_tolerance: float = 0.006
+    grasp_dwell: int = 15
+    release_dwell: int = 20
+    pregrasp_clearance: float = 0.15
+    lift_height: float = 0.40
+    release_clearance: float = 0.04
+    finger_depth: float = 0.03
+
+    def __post_init__(self):
+        for name in ("gain", "max_step", "load_max_step", "threshold", "align_tolerance"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"The expert's {name} must be above 0, not {getattr(self, name)}.")
+        for name in ("grasp_dwell", "release_dwell"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"The expert's {name} must be at least 1 step, not {getattr(self, name)}.")
+
+
+class Expert(Protocol):
+    """A scripted controller.
+
+    `start` gives the progress before the first action. `act` gives the action, (len(task.action_names),) in
+    metres with the gripper last, the phase it belongs to, and the progress after it, or None once the
+    demonstration is over.
+    """
+
+    def __init__(self, config: ExpertConfig): ...
+
+    def start(self, state: PrivilegedState) -> Progress: ...
+
+    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]: ...
+
+
+def make_expert(task: Task, config: ExpertConfig) -> Expert:
+    """The expert of `task`, as its row in the contract table names it."""
+    module, name = task.expert.split(":")
+    return getattr(import_module(module), name)(config)

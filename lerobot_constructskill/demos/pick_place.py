@@ -1,0 +1,95 @@
+"""The six-phase expert of every pick-and-place task: above, down, grasp, lift, carry, release."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress
+
+GRAVITY = 9.81  # m/s2
+
+ABOVE_TOP = 0.02
+"""Height over the object's top at which the jaws wait to be aligned, in metres."""
+
+FINGERS_AROUND = -0.005
+"""Depth of the TCP under the object's top at which the fingers, which reach 9 mm further, are around it, in metres."""
+
+PHASES = tuple(Phase)
+GRIPPER = {
+    phase: GRIPPER_CLOSED if phase in (Phase.GRASP, Phase.LIFT, Phase.CARRY) else GRIPPER_OPEN for phase in Phase
+}
+
+
+@dataclass(frozen=True)
+class PickPlaceExpert:
+    """Proportional control toward each phase's target; a phase ends at a distance or after a dwell."""
+
+    config: ExpertConfig
+
+    def start(self, state: PrivilegedState) -> Progress:
+        return Progress(PHASES[0], 0, state.tcp)
+
+    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]:
+        while self._is_over(state, progress):
+            following = PHASES.index(progress.phase) + 1
+            if following == len(PHASES):
+                break
+            progress = Progress(PHASES[following], 0, state.tcp)
+        phase = progress.phase
+        action = np.array([*self._translation(state, progress), GRIPPER[phase]], dtype=np.float32)
+        after = progress.step()
+        is_last = phase is PHASES[-1] and after.steps >= self.config.release_dwell
+        return action, phase, None if is_last else after
+
+    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+        if progress.phase is Phase.GRASP:
+            return progress.steps >= self.config.grasp_dwell
+        if progress.phase is Phase.RELEASE:
+            return False
+        return bool(np.linalg.norm(self._target(state, progress) - state.tcp) < self.config.threshold)
+
+    def _translation(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        if progress.phase in (Phase.GRASP, Phase.RELEASE):
+            return np.zeros(3)
+        error = self._waypoint(state, progress) - state.tcp
+        if progress.phase not in (Phase.LIFT, Phase.CARRY):
+            return self._toward(error, self.config.max_step)
+        weight = GRAVITY * state.object_mass[0]
+        return self._toward(error, self.config.load_max_step) + [0, 0, self.config.compliance * weight]
+
+    def _toward(self, error: np.ndarray, longest: float) -> np.ndarray:
+        return np.clip(self.config.gain * error, -longest, longest)
+
+    def _target(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        """Where the end effector should go in this phase, (3,) metres."""
+        match progress.phase:
+            case Phase.PREGRASP:
+                return self._grasp_point(state) + [0, 0, self.config.pregrasp_clearance]
+            case Phase.DESCEND:
+                return self._grasp_point(state)
+            case Phase.LIFT:
+                return progress.anchor + [0, 0, self.config.lift_height]
+            case Phase.CARRY:
+                return self._release_point(state)
+        raise ValueError(f"{progress.phase} has no target.")
+
+    def _grasp_point(self, state: PrivilegedState) -> np.ndarray:
+        return state.object_pose[:3] + [0, 0, state.object_size[2] / 2 - self.config.finger_depth]
+
+    def _waypoint(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        """The phase's target, or a point above the object until the jaws are over it: a finger that lands tips it."""
+        target = self._target(state, progress)
+        if progress.phase is not Phase.DESCEND:
+            return target
+        top = target[2] + self.config.finger_depth
+        misaligned = abs((target - state.tcp) @ state.jaw_axis)
+        if misaligned < self.config.align_tolerance or state.tcp[2] < top - FINGERS_AROUND:
+            return target
+        return np.array([*target[:2], top + ABOVE_TOP])
+
+    def _release_point(self, state: PrivilegedState) -> np.ndarray:
+        """Above the bin's centre, the object's underside `release_clearance` above the rim."""
+        rim = state.bin_position[2] + state.bin_interior[2] / 2
+        below_tcp = state.object_size[2] - self.config.finger_depth
+        return np.array([*state.bin_position[:2], rim + self.config.release_clearance + below_tcp])

@@ -1,0 +1,135 @@
+"""Experts and noise: pure functions, checked as such, and experts that must succeed on the real simulator."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from lerobot_constructskill.contract import DEMO_SEED_START, GRIPPER_OPEN, SIM_STATE, TASKS
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig, execute
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+NO_NOISE = NoiseConfig(sigma=0.0)
+
+
+def state(**changes):
+    defaults = {
+        "tcp_pose": [0.0, 0.0, 0.17, 0, 1, 0, 0],
+        "fingers": [0.04, 0.04],
+        "object_pose": [0.0, 0.0, 0.05, 1, 0, 0, 0],
+        "object_size": [0.21, 0.065, 0.10],
+        "object_mass": [1.365],
+        "bin_position": [0.0, -0.35, 0.08],
+        "bin_interior": [0.25, 0.20, 0.15],
+    }
+    return PrivilegedState(**{name: np.array(value, float) for name, value in (defaults | changes).items()})
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def env(request):
+    env = ConstructSkillEnv(request.param, episode_length=300)
+    yield env
+    env.close()
+
+
+def test_the_experts_state_is_the_contracts():
+    assert {field.name for field in fields(PrivilegedState)} == set(SIM_STATE)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_expert_is_a_pure_function(task):
+    expert, s = make_expert(TASKS[task], ExpertConfig()), state()
+    progress = expert.start(s)
+    first, second = expert.act(s, progress), expert.act(s, progress)
+    np.testing.assert_array_equal(first[0], second[0])
+    assert first[1:2] == second[1:2] and progress.steps == 0
+    assert len(first[0]) == len(TASKS[task].action_names)
+
+
+def test_the_expert_stays_above_an_object_it_is_not_over():
+    expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())
+    progress = expert.start(state())
+    over = state(tcp_pose=[0, 0.001, 0.12, 0, 1, 0, 0])
+    beside = state(tcp_pose=[0, 0.012, 0.115, 0, 1, 0, 0])
+    while progress.phase is not Phase.DESCEND:
+        *_, progress = expert.act(state(tcp_pose=[0, 0, 0.22, 0, 1, 0, 0]), progress)
+    assert expert.act(over, progress)[0][2] < 0
+    assert expert.act(beside, progress)[0][2] > 0 and expert.act(beside, progress)[0][1] < 0
+
+
+@pytest.mark.parametrize("bad", [{"gain": 0}, {"max_step": -1}, {"threshold": 0}, {"grasp_dwell": 0}])
+def test_impossible_experts_are_refused(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        ExpertConfig(**bad)
+
+
+@pytest.mark.parametrize(
+    "bad, word", [({"sigma": -0.01}, "-0.01"), ({"clip": 0}, "clip"), ({"phases": ["LFT"]}, "LIFT")]
+)
+def test_impossible_noise_is_refused(bad, word):
+    with pytest.raises(ValueError, match=word):
+        NoiseConfig(**bad)
+
+
+@pytest.mark.parametrize("phase", Phase)
+def test_noise_is_gaussian_where_it_is_on_and_absent_elsewhere(phase):
+    rng, clean = np.random.default_rng(0), np.array([0.0, 0.01, -0.02, GRIPPER_OPEN], dtype=np.float32)
+    noise = np.array([execute(clean, phase, NoiseConfig(), rng) - clean for _ in range(4000)])
+    assert (noise[:, 3] == 0).all()
+    if phase in (Phase.GRASP, Phase.RELEASE):
+        assert (noise == 0).all()
+    else:
+        np.testing.assert_allclose(noise[:, :3].mean(axis=0), 0, atol=6e-4)
+        np.testing.assert_allclose(noise[:, :3].std(axis=0), 0.01, rtol=0.05)
+
+
+def test_the_executed_translation_is_clipped_and_the_label_is_not_touched():
+    clean = np.array([0.075, -0.075, 0.0, -1.0], dtype=np.float32)
+    rng = np.random.default_rng(0)
+    executed = np.array([execute(clean, Phase.LIFT, NoiseConfig(), rng) for _ in range(500)])
+    assert np.abs(executed[:, :3]).max() == np.float32(0.08)
+    np.testing.assert_array_equal(clean, np.array([0.075, -0.075, 0.0, -1.0], dtype=np.float32))
+
+
+@pytest.mark.sim
+def test_every_expert_succeeds_without_noise_through_all_phases_in_order(env):
+    expert = make_expert(TASKS[env.task], ExpertConfig())
+    for seed in range(DEMO_SEED_START, DEMO_SEED_START + 3):
+        frames, success = demonstrate(env, expert, NO_NOISE, seed)
+        assert success and frames[-1]["next.reward"] == 1.0
+        assert list(dict.fromkeys(frame["phase"] for frame in frames)) == list(Phase)
+
+
+@pytest.mark.sim
+def test_every_expert_succeeds_in_nine_of_ten_noisy_attempts(env):
+    expert = make_expert(TASKS[env.task], ExpertConfig())
+    outcomes = [demonstrate(env, expert, NoiseConfig(), DEMO_SEED_START + i)[1] for i in range(10)]
+    assert sum(outcomes) >= 9
+
+
+@pytest.mark.sim
+def test_the_load_compensation_holds_the_brick_where_the_arm_alone_sags():
+    """What `ExpertConfig.compliance` is for: a held brick sinks by centimetres a second where nothing is added."""
+    env = ConstructSkillEnv("brick_to_bin", episode_length=300)
+    expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())
+
+    def drift(upward):
+        """Metres that a lifted brick moves in 20 steps of a constant `upward` translation."""
+        env.reset(seed=0)
+        sim = PrivilegedState(**env.privileged_state())
+        progress = expert.start(sim)
+        while progress.phase is not Phase.CARRY:
+            action, _, progress = expert.act(sim, progress)
+            env.step(action)
+            sim = PrivilegedState(**env.privileged_state())
+        start = sim.tcp[2]
+        for _ in range(20):
+            env.step(np.array([0, 0, upward, -1], dtype=np.float32))
+        return env.privileged_state()["tcp_pose"][2] - start
+
+    weight = 9.81 * 1.365
+    compensated, alone = drift(ExpertConfig().compliance * weight), drift(0.0)
+    env.close()
+    assert alone < -0.03 and 0 < compensated < -alone
