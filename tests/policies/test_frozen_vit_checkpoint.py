@@ -1,0 +1,123 @@
+"""Save, load, and what is said when a checkpoint is not what it should be."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.policies import factory
+from safetensors.torch import load_file, load_model, save_file
+
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+
+
+@pytest.fixture
+def local_weights(weights, tmp_path) -> Path:
+    """A copy of the tiny backbone's weights that a test may take away."""
+    shutil.copytree(weights("vit_tiny16"), tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+def edit_config(checkpoint: Path, **fields: object) -> None:
+    config = json.loads((checkpoint / "config.json").read_text())
+    (checkpoint / "config.json").write_text(json.dumps(config | fields))
+
+
+@pytest.mark.parametrize("save_backbone", [True, False])
+def test_a_loaded_checkpoint_acts_the_same(save_backbone, make_policy, local_weights, images, tmp_path, caplog):
+    policy = make_policy(save_backbone=save_backbone, backbone_path=str(local_weights)).eval()
+    policy.save_pretrained(tmp_path / "checkpoint")
+    if save_backbone:
+        shutil.rmtree(local_weights)  # a checkpoint that holds its backbone needs no other source
+    for strict in (False, True):
+        loaded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "checkpoint", strict=strict)
+        batch = {"observation.images.base": images}
+        torch.testing.assert_close(loaded.select_action(batch), policy.select_action(batch))
+        policy.reset()
+    assert loaded.config.backbone_sha256 == policy.config.backbone_sha256
+    assert loaded.config.backbone_source == f"local {local_weights}"
+    assert "issing key" not in caplog.text
+    holds = any("backbone" in name for name in load_file(tmp_path / "checkpoint" / "model.safetensors"))
+    assert holds == save_backbone
+
+
+@pytest.mark.parametrize("save_backbone", [True, False])
+def test_state_dicts_load_strictly(save_backbone, make_policy, tmp_path):
+    policy = make_policy(save_backbone=save_backbone)
+    policy.load_state_dict(policy.state_dict(), strict=True)
+    policy.save_pretrained(tmp_path)
+    assert load_model(policy, tmp_path / "model.safetensors", strict=True) == (set(), [])
+
+
+def test_a_checkpoint_can_be_fine_tuned_with_the_other_choice(make_policy, images, tmp_path):
+    policy = make_policy(save_backbone=False).eval()
+    policy.save_pretrained(tmp_path / "small")
+    edit_config(tmp_path / "small", save_backbone=True)
+    whole = FrozenViTChunkPolicy.from_pretrained(tmp_path / "small")
+    whole.save_pretrained(tmp_path / "whole")
+    edit_config(tmp_path / "whole", save_backbone=False, backbone_path="gone")
+    again = FrozenViTChunkPolicy.from_pretrained(tmp_path / "whole")
+    batch = {"observation.images.base": images}
+    torch.testing.assert_close(again.select_action(batch), policy.select_action(batch))
+
+
+def test_other_backbone_weights_are_refused(make_policy, weights, tmp_path):
+    for save_backbone in (True, False):
+        make_policy(save_backbone=save_backbone).save_pretrained(tmp_path / str(save_backbone))
+    file = tmp_path / "True" / "model.safetensors"
+    state = load_file(file)
+    state["backbone.model.norm.bias"] += 1e-3
+    save_file(state, file)
+    edit_config(tmp_path / "False", backbone_path=str(weights("vit_tiny16", seed=1)))
+    for save_backbone in (True, False):
+        with pytest.raises(ValueError, match="sha256"):
+            FrozenViTChunkPolicy.from_pretrained(tmp_path / str(save_backbone))
+
+
+def truncate(checkpoint: Path) -> None:
+    file = checkpoint / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:-1000])
+
+
+def drop_head(checkpoint: Path) -> None:
+    state = load_file(checkpoint / "model.safetensors")
+    del state["gripper_head.bias"]
+    save_file(state, checkpoint / "model.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "said"),
+    [
+        (truncate, ValueError, "damaged or truncated"),
+        (lambda checkpoint: (checkpoint / "model.safetensors").write_bytes(b"x" * 99), ValueError, "damaged"),
+        (
+            lambda checkpoint: (checkpoint / "model.safetensors").unlink(),
+            FileNotFoundError,
+            "no weights file",
+        ),
+        (drop_head, ValueError, "does not fit its configuration.*gripper_head.bias"),
+        (
+            lambda checkpoint: edit_config(checkpoint, chunk_size=4),
+            ValueError,
+            "does not fit its configuration",
+        ),
+    ],
+)
+def test_a_damaged_checkpoint_gets_one_sentence_that_names_the_file(damage, error, said, make_policy, tmp_path):
+    make_policy(save_backbone=False).save_pretrained(tmp_path)
+    damage(tmp_path)
+    with pytest.raises(error, match=said) as refusal:
+        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    assert "model.safetensors" in str(refusal.value) and "\n" not in str(refusal.value)
+    assert refusal.value.__cause__ is None
+
+
+def test_lerobot_finds_policy_and_processors_by_their_names(make_policy, tmp_path):
+    assert factory.get_policy_class("frozen_vit") is FrozenViTChunkPolicy
+    config = FrozenViTChunkConfig(device="cpu")
+    stats = {"observation.state": {"mean": torch.zeros(8), "std": torch.ones(8)}}
+    for pipeline in factory.make_pre_post_processors(config, dataset_stats=stats):
+        pipeline.save_pretrained(tmp_path)
+    assert len(factory.make_pre_post_processors(config, pretrained_path=str(tmp_path))) == 2

@@ -1,0 +1,93 @@
+"""What the configuration refuses, and what it takes from a data set."""
+
+import subprocess
+import sys
+
+import pytest
+from lerobot.configs import FeatureType, PolicyFeature
+
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+
+CAMERA = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 480, 640))}
+FEATURES = {"observation.features.base": PolicyFeature(FeatureType.STATE, (384,))}
+OTHER = {"observation.images.top": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"backbone": "resnet18"}, "dinov2_vits14, clip_vitb16, vit_tiny16, vit_tiny16_augreg"),
+        ({"backbone_precision": "float16"}, "float32, bfloat16"),
+        ({"gripper_head": "mse"}, "bce, regression"),
+        ({"chunk_size": 0}, "at least 1, got 0"),
+        ({"n_action_steps": 9, "temporal_ensemble_coeff": None}, "between 1 and chunk_size=8, got 9"),
+        ({"n_action_steps": 2}, "must be 1 with temporal ensembling, got 2"),
+        ({"n_obs_steps": 2}, "got 2"),
+        ({"action_scale": 0.0}, "got 0.0"),
+        ({"action_names": ["dx", "dy", "dz"]}, "gripper"),
+        ({"action_names": ["gripper"]}, "one or more of"),
+        ({"action_names": ["dx", "dx", "gripper"]}, "each once"),
+        ({"action_names": ["joint_0", "gripper"]}, "joint_0"),
+    ],
+)
+def test_nonsense_is_refused_with_the_valid_choices(fields: dict, said: str):
+    with pytest.raises(ValueError, match=said) as refusal:
+        FrozenViTChunkConfig(device="cpu", **fields)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("names", [["dx", "dy", "dz", "gripper"], ["dx", "dy", "dz", "dyaw", "gripper"]])
+def test_action_names_come_from_the_data_set(names: list[str]):
+    config = FrozenViTChunkConfig(device="cpu")
+    config.set_dataset_feature_metadata({"action": {"dtype": "float32", "shape": (len(names),), "names": names}})
+    assert config.action_names == names
+
+
+@pytest.mark.parametrize("names", [None, {"motors": ["dx", "gripper"]}, ["gripper", "dx"], ["q0", "q1"]])
+def test_other_action_names_are_refused(names: object):
+    with pytest.raises(ValueError, match="one or more of dx, dy, dz"):
+        FrozenViTChunkConfig(device="cpu").set_dataset_feature_metadata({"action": {"names": names}})
+
+
+def test_a_checkpoint_refuses_a_data_set_with_other_actions():
+    config = FrozenViTChunkConfig(device="cpu", pretrained_path="somewhere")
+    with pytest.raises(ValueError, match="The checkpoint acts in"):
+        config.set_dataset_feature_metadata({"action": {"names": ["dx", "dy", "gripper"]}})
+
+
+@pytest.mark.parametrize(("inputs", "shape"), [(CAMERA, (3, 480, 640)), (FEATURES, (3, 224, 224))])
+def test_inputs_are_narrowed_to_the_one_camera(inputs: dict, shape: tuple):
+    config = FrozenViTChunkConfig(device="cpu", input_features={**inputs, **OTHER, **STATE})
+    for _ in range(2):
+        config.validate_features()
+        assert config.input_features == {"observation.images.base": PolicyFeature(FeatureType.VISUAL, shape)}
+
+
+def test_the_state_is_an_input_on_request():
+    config = FrozenViTChunkConfig(device="cpu", use_state=True, input_features=CAMERA | STATE)
+    config.validate_features()
+    assert set(config.input_features) == set(CAMERA | STATE)
+
+
+@pytest.mark.parametrize(
+    ("fields", "inputs", "said"),
+    [
+        ({}, OTHER | STATE, "the inputs are: observation.images.top, observation.state"),
+        ({"camera": "wrist"}, CAMERA, "observation.images.wrist"),
+        ({"use_state": True}, CAMERA, "use_state needs observation.state"),
+        ({"output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))}}, CAMERA, "shape"),
+    ],
+)
+def test_missing_inputs_are_named(fields: dict, inputs: dict, said: str):
+    with pytest.raises(ValueError, match=said):
+        FrozenViTChunkConfig(device="cpu", input_features=inputs, **fields).validate_features()
+
+
+def test_importing_the_configuration_imports_no_model():
+    module = "lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit"
+    heavy = "['transformers.models.dinov2.modeling_dinov2', 'timm', 'mani_skill', 'sapien']"
+    modeling = module.replace("configuration", "modeling")
+    code = f"import sys, {module}; print([m for m in {heavy} + ['{modeling}'] if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

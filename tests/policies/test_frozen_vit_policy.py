@@ -1,0 +1,176 @@
+"""What the policy computes: bounds, loss, ensembling, thresholds, and what stays frozen."""
+
+import math
+
+import pytest
+import torch
+
+from lerobot_constructskill.policies.frozen_vit.ensembling import ensemble
+
+ABLATIONS = [{}, {"chunk_size": 1}, {"temporal_ensemble_coeff": None}, {"gripper_head": "regression"}]
+BACKENDS = [*ABLATIONS, {"use_state": True}, {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]}]
+
+
+def logits(policy, translation: float, gripper: list[float]) -> torch.Tensor:
+    """A (1, T, A) chunk as the heads give it."""
+    chunk = torch.full((1, len(gripper), len(policy.config.action_names)), translation)
+    chunk[..., -1] = torch.tensor(gripper)
+    return chunk
+
+
+@pytest.mark.parametrize("fields", BACKENDS)
+def test_every_variant_learns_and_acts(fields, make_policy, make_batch):
+    policy = make_policy(**fields).train()
+    batch = make_batch(policy)
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    losses = []
+    for _ in range(60):
+        loss, logs = policy.forward(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.2 * losses[0]
+    assert all(type(value) is float for value in logs.values())
+    chunk, action = policy.predict_action_chunk(batch), policy.select_action(batch)
+    assert chunk.shape == batch["action"].shape and action.shape == chunk[:, 0].shape
+    assert chunk[..., :-1].abs().max() <= policy.config.action_scale
+    assert set(chunk[..., -1].unique().tolist()) <= {-1.0, 1.0}
+    torch.testing.assert_close(action, chunk[:, 0])
+
+
+def test_only_the_heads_train(make_policy, make_batch, images):
+    policy = make_policy().train()
+    assert policy.training and not policy.backbone.training
+    before = policy(make_batch(policy, 2) | {"observation.images.base": images})[0]
+    assert before.requires_grad
+    assert {name for name, p in policy.named_parameters() if p.requires_grad} == {
+        f"{head}.{kind}" for head in ("translation_head", "gripper_head") for kind in ("weight", "bias")
+    }
+    assert sum(p.numel() for p in policy.get_optim_params()) == 193 * 8 * 4
+
+
+def test_heads_do_not_depend_on_the_backbones_initialisation(make_policy, weights):
+    one, other = make_policy(), make_policy(backbone_path=str(weights("vit_tiny16", seed=1)))
+    torch.testing.assert_close(one.gripper_head.weight, other.gripper_head.weight)
+
+
+@pytest.mark.parametrize("gripper_head", ["bce", "regression"])
+def test_padded_steps_do_not_count(gripper_head, make_policy, make_batch):
+    policy = make_policy(gripper_head=gripper_head)
+    batch = make_batch(policy)
+    changed = {**batch, "action": batch["action"].clone()}
+    changed["action"][batch["action_is_pad"]] = 7.0
+    for reduction in ("mean", "none"):
+        torch.testing.assert_close(policy.forward(batch, reduction)[0], policy.forward(changed, reduction)[0])
+
+
+def test_the_loss_is_the_written_one(make_policy, make_batch):
+    policy = make_policy()
+    batch = make_batch(policy)
+    raw, target, valid = policy._raw_chunk(batch), batch["action"], ~batch["action_is_pad"]
+    squared = (raw[..., :-1] - target[..., :-1])[valid].pow(2).mean()
+    p_open = raw[..., -1].sigmoid()[valid]
+    label = target[..., -1][valid] > 0
+    entropy = -torch.where(label, p_open, 1 - p_open).log().mean()
+    torch.testing.assert_close(policy.forward(batch)[0], squared + entropy)
+    per_sample = policy.forward(batch, reduction="none")[0]
+    n_valid = valid.sum(1)
+    torch.testing.assert_close((per_sample * n_valid).sum() / n_valid.sum(), squared + entropy)
+
+
+@pytest.mark.parametrize("coeff", [-0.1, 0.0, 0.1])
+def test_ensembling_is_the_papers_sum(coeff):
+    chunks = [torch.randn(2, 8, 4, dtype=torch.float64) for _ in range(5)]
+    total = norm = 0
+    for k in range(5):  # steps since the chunk was predicted; 0 is the newest
+        weight = math.exp(coeff * k)
+        total, norm = total + weight * chunks[4 - k][:, k], norm + weight
+    torch.testing.assert_close(ensemble(chunks, coeff), total / norm)
+
+
+def test_the_default_sign_weighs_the_newest_chunk_most():
+    votes = [torch.zeros(1, 8, 1) for _ in range(8)]
+    shares = []
+    for k in range(8):
+        one = [vote.clone() for vote in votes]
+        one[7 - k][:] = 1.0
+        shares.append(ensemble(one, -0.1).item())
+    assert shares == sorted(shares, reverse=True)
+    assert shares[1] / shares[0] == pytest.approx(math.exp(-0.1))
+
+
+def test_an_episode_is_ensembled_over_its_last_chunks_and_forgotten_at_reset(make_policy, monkeypatch):
+    policy = make_policy(chunk_size=3)
+    chunks = [logits(policy, t / 100, [t, t + 10, t + 20]) for t in range(6)]
+    fed = iter(chunks + chunks)
+    monkeypatch.setattr(policy, "_raw_chunk", lambda batch: next(fed))
+    actions = [policy.select_action({}) for _ in range(6)]
+    torch.testing.assert_close(actions[5][:, :3], ensemble(chunks[3:], -0.1)[:, :3])
+    policy.reset()
+    torch.testing.assert_close(policy.select_action({}), actions[0])
+
+
+@pytest.mark.parametrize(
+    ("gripper_head", "raw", "state"),
+    [("bce", 0.4, -1.0), ("bce", 0.6, 1.0), ("regression", -0.1, -1.0), ("regression", 0.1, 1.0)],
+)
+def test_the_gripper_boundary(gripper_head, raw, state, make_policy, monkeypatch):
+    policy = make_policy(gripper_head=gripper_head)
+    monkeypatch.setattr(policy, "_raw_chunk", lambda batch: logits(policy, 0.0, [raw] * 8))
+    assert policy.select_action({})[0, -1] == state
+
+
+def test_logits_are_ensembled_before_the_threshold(make_policy, monkeypatch):
+    policy = make_policy(chunk_size=2)
+    fed = iter([logits(policy, 0.0, [9.0, 9.0]), logits(policy, 0.0, [-2.0, -2.0])])
+    monkeypatch.setattr(policy, "_raw_chunk", lambda batch: next(fed))
+    policy.select_action({})
+    assert policy.select_action({})[0, -1] == 1.0
+
+
+@pytest.mark.parametrize("n_action_steps", [1, 3])
+def test_without_ensembling_a_chunk_is_followed(n_action_steps, make_policy, monkeypatch):
+    policy = make_policy(temporal_ensemble_coeff=None, n_action_steps=n_action_steps)
+    chunks = [torch.rand(1, 8, 4) for _ in range(3)]
+    fed = iter(chunks)
+    monkeypatch.setattr(policy, "_raw_chunk", lambda batch: next(fed))
+    taken = torch.cat([policy.select_action({}) for _ in range(3)])
+    expected = torch.cat(chunks)[:, 0] if n_action_steps == 1 else chunks[0][0, :3]
+    torch.testing.assert_close(taken[:, :3], expected[:, :3])
+
+
+def test_the_heldout_error_is_reported_once_in_training(make_policy, make_batch):
+    policy = make_policy(action_names=["dx", "dy", "dz", "dyaw", "gripper"])
+    heldout = [make_batch(policy, 4, seed=1), make_batch(policy, 3, seed=2)]
+    policy.eval()
+    for batch in heldout:
+        assert "heldout_translation_mse_m2" not in policy.forward(batch)[1]
+    policy.train()
+    policy.train()  # as LeRobot's loop does: after the evaluation, and again before the step
+    reported = [policy.forward(make_batch(policy))[1] for _ in range(2)]
+    errors = []
+    for batch in heldout:
+        difference = policy.predict_action_chunk(batch) - batch["action"]
+        errors.append(difference[~batch["action_is_pad"]][:, :3].pow(2).flatten())
+    assert reported[0]["heldout_translation_mse_m2"] == pytest.approx(torch.cat(errors).mean().item(), rel=1e-5)
+    assert "heldout_translation_mse_m2" not in reported[1]
+
+
+def test_features_give_the_same_action_as_the_image(make_policy, images):
+    policy = make_policy().eval()
+    feature = policy.backbone(images)
+    torch.testing.assert_close(
+        policy.predict_action_chunk({"observation.images.base": images}),
+        policy.predict_action_chunk({"observation.features.base": feature}),
+    )
+
+
+def test_a_batch_without_camera_says_what_it_holds(make_policy):
+    with pytest.raises(ValueError, match="the batch holds: observation.images.top"):
+        make_policy().select_action({"observation.images.top": torch.zeros(1, 3, 224, 224)})
+
+
+def test_peft_is_refused(make_policy):
+    with pytest.raises(NotImplementedError, match="PEFT"):
+        make_policy().wrap_with_peft()
