@@ -1,0 +1,139 @@
+"""`constructskill-doctor`: names what is wrong on a machine, one line for each check."""
+
+import argparse
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from importlib import metadata
+
+from lerobot_constructskill.scripts.checks import (
+    DISTRIBUTION,
+    Finding,
+    Level,
+    Probe,
+    judge_ffmpeg,
+    judge_mesa,
+    judge_name,
+    judge_opencv,
+    judge_plugin,
+    judge_python,
+    judge_versions,
+    judge_vulkan,
+    judge_weights,
+)
+
+PROBE_TIMEOUT_S = 180
+
+RENDER = """
+import sapien
+try:
+    device = sapien.Device("cuda")
+except RuntimeError:
+    device = sapien.Device("cpu")
+sapien.render.RenderSystem(device)
+print(device.name)
+"""
+
+REGISTER = """
+from lerobot.utils.import_utils import register_third_party_plugins
+register_third_party_plugins()
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+print("frozen_vit" in PreTrainedConfig.get_known_choices(), "constructskill" in EnvConfig.get_known_choices())
+"""
+
+DECODE = "from torchcodec.decoders import VideoDecoder"
+
+# Asks whether the weights are there, not for the weights: those of all backbones together are 0.5 GB.
+FIND_WEIGHTS = """
+from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+from lerobot_constructskill.policies.frozen_vit.weights import find_source
+for backbone in BACKBONES.values():
+    print(backbone.name, find_source(backbone) or "", sep="\\t")
+"""
+
+
+def probe(code: str) -> Probe:
+    """Run a snippet in a fresh Python and keep its output, and the last line it complained with."""
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return Probe(False, "", f"no answer within {PROBE_TIMEOUT_S} s")
+    complaint = (done.stderr.strip().splitlines() or [""])[-1]
+    if done.returncode < 0:
+        complaint = f"the process died of signal {-done.returncode}"
+    return Probe(done.returncode == 0, done.stdout.strip(), complaint)
+
+
+def installed_versions() -> dict[str, str]:
+    """Versions of the installed distributions under their raw names."""
+    return {d.metadata["Name"]: d.version for d in metadata.distributions() if d.metadata["Name"]}
+
+
+def mesa_version() -> str | None:
+    if shutil.which("dpkg-query") is None:
+        return None
+    query = ["dpkg-query", "-W", "-f", "${Version}", "mesa-vulkan-drivers"]
+    return subprocess.run(query, capture_output=True, text=True, check=False).stdout or None
+
+
+def has_gpu() -> bool:
+    if shutil.which("nvidia-smi") is None:
+        return False
+    return subprocess.run(["nvidia-smi", "-L"], capture_output=True, check=False).returncode == 0
+
+
+def check_versions() -> Finding:
+    from packaging.utils import canonicalize_name
+
+    installed = installed_versions()
+    requirements = metadata.requires(DISTRIBUTION) if DISTRIBUTION in installed else None
+    return judge_versions(requirements or [], {canonicalize_name(n): v for n, v in installed.items()})
+
+
+def check_vulkan() -> Finding:
+    if "sapien" not in installed_versions():
+        return judge_vulkan(Probe(False, "", ""), simulator=False)
+    return judge_vulkan(probe(RENDER), simulator=True)
+
+
+CHECKS: tuple[Callable[[], Finding], ...] = (
+    lambda: judge_python(sys.version_info[:2]),
+    lambda: judge_name(list(installed_versions())),
+    check_versions,
+    lambda: judge_opencv(list(installed_versions())),
+    lambda: judge_mesa(mesa_version(), has_gpu()),
+    check_vulkan,
+    lambda: judge_ffmpeg(probe(DECODE)),
+    lambda: judge_plugin(probe(REGISTER)),
+    lambda: judge_weights(probe(FIND_WEIGHTS)),
+)
+
+
+def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
+    """Run the checks, print each finding as it comes, and return the exit status: 1 where one failed."""
+    levels = []
+    for check in checks:
+        finding = check()
+        levels.append(finding.level)
+        print(f"{finding.level:<4}  {finding.name:<12}  {finding.message}", flush=True)
+    failed, warned = levels.count(Level.FAIL), levels.count(Level.WARN)
+    print(f"{len(levels)} checks, {failed} failed, {warned} warned.")
+    return int(failed > 0)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="constructskill-doctor",
+        description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin and the pretrained weights "
+        "of this machine (about a minute). Exit status 1 where something fails.",
+    )
+    parser.parse_args()
+    return diagnose()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,155 @@
+"""The rooms of the package and the arrows between them, read from the sources: imports run downward only."""
+
+import ast
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "lerobot_constructskill"
+ROOT = Path(__file__).parents[1] / PACKAGE
+SIMULATOR = {"sapien", "mani_skill", "mplib"}
+
+# What a room, or a file with a row of its own, may import of ours; its own room goes without saying.
+ARROWS = {
+    "contract": (),
+    "policies": (),
+    "sim": ("contract",),
+    "envs": ("contract",),
+    "plugin": ("envs", "policies"),
+    "demos": ("contract",),
+    "demos.demonstrate": ("contract", "envs"),
+    "demos.recorder": ("contract", "envs"),
+    "features": ("contract", "policies"),
+    "study": ("contract", "features", "policies"),
+    "study.rollout": ("contract", "envs", "policies"),
+    "scripts": ("contract", "plugin", "policies", "sim", "envs", "demos", "features", "study"),
+}
+# Arrows of functions: the simulator is born on first use.
+LAZY_ARROWS = {"envs": ("sim",)}
+
+# Files that name every package they may import.
+EXTERNALS = {
+    "contract": set(),
+    "study.stats": {"numpy", "scipy", "statsmodels"},
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported module, absolute; `eager` where importing the file runs it."""
+
+    target: str
+    eager: bool
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+SOURCES = {module_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+
+
+def targets(node: ast.Import | ast.ImportFrom, path: Path) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+        return
+    base = node.module or ""
+    if node.level:
+        package = path.relative_to(ROOT.parent).parent.parts
+        base = ".".join((*package[: len(package) - node.level + 1], *filter(None, [base])))
+    for alias in node.names:
+        inner = f"{base}.{alias.name}"
+        yield inner if inner in SOURCES else base
+
+
+def is_type_checking(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def imports(path: Path, node: ast.AST | None = None, eager: bool = True) -> Iterator[Import]:
+    for child in ast.iter_child_nodes(node or ast.parse(path.read_text())):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield from (Import(target, eager) for target in targets(child, path))
+        else:
+            lazy = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) or is_type_checking(child)
+            yield from imports(path, child, eager and not lazy)
+
+
+def row(module: str, table: dict) -> str | None:
+    """The longest entry of a table that a module lies in."""
+    inner = module.removeprefix(f"{PACKAGE}.")
+    return max((key for key in table if f"{inner}.".startswith(f"{key}.")), key=len, default=None)
+
+
+def room(module: str) -> str:
+    return module.removeprefix(PACKAGE).removeprefix(".").split(".")[0]
+
+
+def is_ours(target: str) -> bool:
+    return target.split(".")[0] == PACKAGE
+
+
+@pytest.mark.parametrize("module", SOURCES)
+def test_arrows_point_downward(module: str) -> None:
+    own = row(module, ARROWS)
+    assert own is not None or module == PACKAGE, f"{module} is in no room of the table"
+    for found in imports(SOURCES[module]):
+        if not is_ours(found.target) or room(found.target) == room(module):
+            continue
+        allowed = (*ARROWS[own], *(() if found.eager else LAZY_ARROWS.get(own, ())))
+        assert room(found.target) in allowed, f"{module} imports {found.target}"
+
+
+@pytest.mark.parametrize("module", SOURCES)
+def test_simulator_stays_in_its_room(module: str) -> None:
+    names = {found.target.split(".")[0] for found in imports(SOURCES[module])}
+    assert room(module) == "sim" or not names & SIMULATOR
+
+
+@pytest.mark.parametrize("module", [module for module in SOURCES if row(module, EXTERNALS)])
+def test_listed_externals_only(module: str) -> None:
+    names = {found.target.split(".")[0] for found in imports(SOURCES[module]) if not is_ours(found.target)}
+    assert names <= EXTERNALS[row(module, EXTERNALS)] | set(sys.stdlib_module_names)
+
+
+def test_report_needs_neither_torch_nor_more_than_stats() -> None:
+    for module in (f"{PACKAGE}.study.stats", f"{PACKAGE}.study.report"):
+        found = {found.target for found in imports(SOURCES[module])} if module in SOURCES else set()
+        assert {target for target in found if is_ours(target)} <= {f"{PACKAGE}.study.stats"}
+        assert not {"torch", "lerobot"} & {target.split(".")[0] for target in found}
+
+
+def test_only_rollout_meets_environments_and_policies() -> None:
+    rooms = {
+        module: {room(found.target) for found in imports(path) if is_ours(found.target)}
+        for module, path in SOURCES.items()
+        if room(module) in ("study", "demos", "features", "envs", "policies")
+    }
+    both = {module for module, met in rooms.items() if {"envs", "policies"} <= met | {room(module)}}
+    assert both <= {f"{PACKAGE}.study.rollout"}
+
+
+@pytest.mark.parametrize("module", [module for module, path in SOURCES.items() if path.name == "__init__.py"])
+def test_init_is_inert(module: str) -> None:
+    body = ast.parse(SOURCES[module].read_text()).body
+    assert not [node for node in body if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))]
+
+
+def test_every_folder_is_a_package() -> None:
+    assert not [path for path in SOURCES.values() if not (path.parent / "__init__.py").is_file()]
+
+
+def test_no_import_circle() -> None:
+    graph = {
+        module: {found.target for found in imports(path) if found.eager and found.target in SOURCES} - {PACKAGE}
+        for module, path in SOURCES.items()
+    }
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"import circle: {' -> '.join(error.args[1])}")

@@ -1,0 +1,159 @@
+"""The doctor's judgements on made-up machines, and the functions of setup.sh on made-up files."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.scripts import checks
+from lerobot_constructskill.scripts.checks import Finding, Level, Probe
+from lerobot_constructskill.scripts.doctor import diagnose, probe
+
+REPOSITORY = Path(__file__).parents[1]
+REQUIREMENTS = ["lerobot[dataset]<0.7,>=0.6.1", "sapien<3.1,>=3.0.3; extra == 'sim'", "ruff; extra == 'dev'"]
+RENDERS = Probe(True, "cpu", "")
+BROKEN = Probe(False, "", "RuntimeError: no such thing")
+
+
+@pytest.mark.parametrize(
+    ("finding", "level"),
+    [
+        (checks.judge_python((3, 12)), Level.OK),
+        (checks.judge_python((3, 11)), Level.FAIL),
+        (checks.judge_python((3, 13)), Level.WARN),
+        (checks.judge_name(["numpy", "lerobot_env_constructskill"]), Level.OK),
+        (checks.judge_name(["lerobot-env-constructskill"]), Level.FAIL),
+        (checks.judge_name([]), Level.FAIL),
+        (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1", "sapien": "3.0.3"}), Level.OK),
+        (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1"}), Level.WARN),
+        (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.7.0", "sapien": "3.0.3"}), Level.FAIL),
+        (checks.judge_versions(REQUIREMENTS, {"sapien": "3.0.3"}), Level.FAIL),
+        (checks.judge_opencv(["opencv-python-headless"]), Level.OK),
+        (checks.judge_opencv(["opencv-python-headless", "opencv-python"]), Level.WARN),
+        (checks.judge_opencv([]), Level.FAIL),
+        (checks.judge_mesa("25.0.7-2~bpo12+1", gpu=False), Level.OK),
+        (checks.judge_mesa("24.3.0-1", gpu=False), Level.OK),
+        (checks.judge_mesa("22.3.6-1+deb12u2", gpu=False), Level.FAIL),
+        (checks.judge_mesa("24.2.8-1ubuntu1", gpu=False), Level.FAIL),
+        (checks.judge_mesa(None, gpu=False), Level.WARN),
+        (checks.judge_mesa("22.3.6", gpu=True), Level.OK),
+        (checks.judge_vulkan(RENDERS, simulator=True), Level.OK),
+        (checks.judge_vulkan(BROKEN, simulator=True), Level.FAIL),
+        (checks.judge_vulkan(BROKEN, simulator=False), Level.WARN),
+        (checks.judge_plugin(Probe(True, "True True", "")), Level.OK),
+        (checks.judge_plugin(Probe(True, "True False", "")), Level.FAIL),
+        (checks.judge_plugin(BROKEN), Level.FAIL),
+        (checks.judge_ffmpeg(RENDERS), Level.OK),
+        (checks.judge_ffmpeg(BROKEN), Level.WARN),
+        (checks.judge_weights(Probe(True, "a\tHub\nb\tHub cache", "")), Level.OK),
+        (checks.judge_weights(Probe(True, "a\tHub\nb", "")), Level.WARN),
+        (checks.judge_weights(Probe(True, "a\t\nb", "")), Level.FAIL),
+        (checks.judge_weights(BROKEN), Level.FAIL),
+    ],
+)
+def test_judgement(finding: Finding, level: Level) -> None:
+    assert finding.level == level, finding
+    assert "\n" not in finding.message
+    assert level is Level.OK or finding.message.endswith("."), "a complaint is a sentence that says what to do"
+
+
+def test_complaints_name_their_cause() -> None:
+    assert "opencv-python and opencv-python-headless" in checks.judge_opencv(checks.OPENCV[:2]).message
+    assert "lerobot is 0.5 (needs <0.7,>=0.6.1)" in checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
+    assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
+    assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb", "")).message
+
+
+@pytest.mark.parametrize(("level", "status"), [(Level.OK, 0), (Level.WARN, 0), (Level.FAIL, 1)])
+def test_exit_status(level: Level, status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert diagnose([lambda: Finding(level, "Thing", "a message.")]) == status
+    assert capsys.readouterr().out.startswith(f"{level}")
+
+
+def test_probe_survives_what_it_runs() -> None:
+    assert probe("print('hello')") == Probe(True, "hello", "")
+    assert probe("raise RuntimeError('a\\nb')").reason == "b"
+    assert "signal" in probe("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)").reason
+
+
+def shell(snippet: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run a snippet with the functions of setup.sh at hand."""
+    code = f"source '{REPOSITORY / 'setup.sh'}'; {snippet}"
+    return subprocess.run(["bash", "-c", code, "bash", *map(str, arguments)], capture_output=True, text=True)
+
+
+def test_setup_and_doctor_want_the_same_mesa() -> None:
+    minimum = re.search(r"^MESA_MINIMUM=(.*)$", (REPOSITORY / "setup.sh").read_text(), re.MULTILINE)
+    assert minimum is not None
+    assert minimum[1] == ".".join(map(str, checks.MESA_MINIMUM))
+
+
+DEB822 = """\
+# A comment
+Types: deb-src
+URIs: http://sources.example/debian
+Suites: bookworm
+
+Types: deb
+Enabled: no
+URIs: http://disabled.example/debian
+Suites: bookworm
+
+Types: deb
+# between two fields
+URIs: http://mirror.example/debian http://second.example/debian
+Suites: bookworm bookworm-updates
+Components: main
+Signed-By: /keys/debian.gpg
+
+Types: deb
+URIs: http://security.example/debian
+Suites: bookworm-security
+"""
+ONE_LINE = """\
+#deb http://comment.example/debian bookworm main
+deb-src http://sources.example/debian bookworm main
+deb http://security.example/debian bookworm-security main
+deb [arch=amd64 signed-by=/keys/debian.gpg] http://mirror.example/debian bookworm main contrib
+"""
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "signed"),
+    [
+        ("sources.list.d/debian.sources", DEB822, True),
+        ("sources.list", ONE_LINE, True),
+        ("sources.list.d/debian.list", ONE_LINE, True),
+        ("sources.list", "deb http://mirror.example/debian bookworm main\n", False),
+    ],
+)
+def test_backports_come_from_the_machines_own_mirror(tmp_path: Path, file: str, text: str, signed: bool) -> None:
+    (tmp_path / "sources.list.d").mkdir()
+    (tmp_path / file).write_text(text)
+    stanza = shell('backports_stanza "$1" bookworm', tmp_path)
+    assert stanza.returncode == 0, stanza.stderr
+    lines = [
+        "Types: deb",
+        "URIs: http://mirror.example/debian",
+        "Suites: bookworm-backports",
+        "Components: main",
+    ]
+    assert stanza.stdout.splitlines() == lines + ["Signed-By: /keys/debian.gpg"] * signed
+    assert shell('backports_stanza "$1" trixie', tmp_path).returncode != 0
+
+
+@pytest.mark.parametrize(("version", "good"), [("22.3.6-1+deb12u2", False), ("25.0.7-2~bpo12+1", True), ("", False)])
+def test_setup_judges_mesa(version: str, good: bool) -> None:
+    assert (shell('new_enough "$1"', version).returncode == 0) is good
+
+
+def test_setup_passes_over_a_python_that_does_not_run(tmp_path: Path) -> None:
+    shim = tmp_path / "python3.12"
+    shim.write_text("#!/bin/sh\necho 'python3.12: command not found' >&2\nexit 127\n")
+    shim.chmod(0o755)
+    assert shell('is_right_python "$1"', shim).returncode != 0
+    working = Path(sys.executable).with_name("python3.12")
+    found = shell('PATH="$1:$2:$PATH" find_python', tmp_path, working.parent)
+    assert found.stdout.strip() == str(working)
