@@ -1,17 +1,20 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check pins
+.PHONY: help setup demo ten-seeds test check pins
 
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
 PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-7s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
 
 setup: ## make .venv/ and install what it needs from the system
 	@./setup.sh
 
 demo: setup ## demonstrations, training, evaluation and a video, end to end
 	@examples/demo.sh
+
+ten-seeds: setup ## ten training seeds of frozen_vit on the fast set, lift and place counts per seed
+	@OUT=outputs/fast EPISODES=80 SEEDS="0 1 2 3 4 5 6 7 8 9" TRAIN=frozen_vit_fast examples/demo.sh
 
 test: setup ## every test
 	$(PARALLEL)

@@ -13,6 +13,7 @@ from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.dataset_tools import modify_features
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 from tqdm import tqdm
 
@@ -71,8 +72,9 @@ def write_feature_set(
 ) -> LeRobotDataset:
     """Write a copy of `dataset` with `features` (N, D) in place of its images.
 
-    Indices, episodes, tasks and every other column stay as they are. The copy appears under `root` when it is
-    complete; until then it stands in `<root>.partial`.
+    Indices, episodes, tasks, actions and other observations stay as they are; columns that no policy reads are left
+    out, because LeRobot's loader takes time for each. The copy appears under `root` when it is complete; until then
+    it stands in `<root>.partial`.
 
     Raises:
         FileExistsError: `root` exists.
@@ -82,13 +84,19 @@ def write_feature_set(
     info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
     column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}
     staged = partial / "dataset"
-    copy = modify_features(dataset, {key: (features, column)}, list(dataset.meta.camera_keys), staged, repo_id)
+    copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), staged, repo_id)
     stats = compute_episode_stats({key: features}, {key: column})
     write_stats({**(copy.meta.stats or {}), **stats}, staged)
     _forget_videos(staged)
     staged.rename(root)
     shutil.rmtree(partial)
     return LeRobotDataset(repo_id, root=root)
+
+
+def _left_out(dataset: LeRobotDataset) -> list[str]:
+    read = [name for name in dataset.meta.features if name.startswith(("observation.", "action"))]
+    kept = set(read) - set(dataset.meta.camera_keys) | set(DEFAULT_FEATURES)
+    return [name for name in dataset.meta.features if name not in kept]
 
 
 def partial_of(root: Path) -> Path:

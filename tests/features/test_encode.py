@@ -97,13 +97,14 @@ def policy_config(weights: Path, **fields: object) -> FrozenViTChunkConfig:
     return FrozenViTChunkConfig(device="cpu", **fields)
 
 
-def test_everything_but_the_images_is_as_before(source, encoded):
+def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encoded):
+    assert {name for name in encoded.meta.features if "." in name} == {"observation.state", KEY}
     assert not encoded.meta.camera_keys and not list(encoded.root.rglob("*.mp4"))
     assert encoded.meta.total_episodes == len(LENGTHS) and len(encoded) == sum(LENGTHS)
     assert list(encoded.meta.tasks.index) == list(source.meta.tasks.index)
     assert not any(name.startswith("videos/") for name in encoded.meta.episodes.column_names)
     for before, after in zip(source, encoded, strict=True):
-        for name in set(before) - set(source.meta.camera_keys):
+        for name in set(before) & set(after):
             assert (
                 torch.equal(before[name], after[name])
                 if torch.is_tensor(before[name])

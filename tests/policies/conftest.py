@@ -41,7 +41,9 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 def make_policy(weights: Callable[..., Path]) -> MakePolicy:
     """Make a policy on a random tiny backbone; keywords are configuration fields."""
 
-    def make(camera_shape: tuple[int, ...] = (3, 224, 224), **fields) -> FrozenViTChunkPolicy:
+    def make(
+        camera_shape: tuple[int, ...] = (3, 224, 224), dataset_stats: dict | None = None, **fields
+    ) -> FrozenViTChunkPolicy:
         backbone = fields.setdefault("backbone", TINY)
         fields.setdefault("backbone_path", str(weights(backbone)))
         config = FrozenViTChunkConfig(device="cpu", **fields)
@@ -50,14 +52,14 @@ def make_policy(weights: Callable[..., Path]) -> MakePolicy:
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         }
         torch.manual_seed(0)
-        return FrozenViTChunkPolicy(config)
+        return FrozenViTChunkPolicy(config, dataset_stats=dataset_stats)
 
     return make
 
 
 @pytest.fixture
 def make_batch() -> Callable[..., Batch]:
-    """Make a batch of features, states and chunks ; the last two steps of sample 0 are padded."""
+    """Make a batch of features, states and chunks; the last two steps of sample 0 are padded."""
 
     def make(policy: FrozenViTChunkPolicy, size: int = 4, seed: int = 0) -> Batch:
         rng = torch.Generator().manual_seed(seed)

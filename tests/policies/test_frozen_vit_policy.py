@@ -166,6 +166,26 @@ def test_features_give_the_same_action_as_the_image(make_policy, images):
     )
 
 
+def test_standardised_features_are_the_same_linear_heads_in_other_units(make_policy, make_batch, tmp_path):
+    batch = make_batch(make_policy())
+    features = batch["observation.features.base"]
+    stats = {"observation.features.base": {"mean": features.mean(0) + 1.0, "std": features.std(0) * 2}}
+    standardised = make_policy(standardize_features=True, dataset_stats=stats)
+    mean, std = (torch.as_tensor(value) for value in stats["observation.features.base"].values())
+    moved = {**batch, "observation.features.base": features * std + mean}
+    torch.testing.assert_close(
+        standardised.predict_action_chunk(moved), make_policy().predict_action_chunk(batch), atol=1e-5, rtol=1e-4
+    )
+    standardised.save_pretrained(tmp_path)
+    again = type(standardised).from_pretrained(tmp_path, local_files_only=True)
+    torch.testing.assert_close(again.predict_action_chunk(moved), standardised.predict_action_chunk(moved))
+
+
+def test_standardised_features_need_statistics(make_policy):
+    with pytest.raises(ValueError, match="constructskill-encode"):
+        make_policy(standardize_features=True)
+
+
 def test_a_batch_without_camera_says_what_it_holds(make_policy):
     with pytest.raises(ValueError, match="the batch holds: observation.images.top"):
         make_policy().select_action({"observation.images.top": torch.zeros(1, 3, 224, 224)})

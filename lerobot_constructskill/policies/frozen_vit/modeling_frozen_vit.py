@@ -29,6 +29,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     Args:
         config: the configuration; the source and hash of the backbone's weights are written into it.
+        dataset_stats: the training set's statistics; those of a feature set serve `standardize_features`.
         load_backbone: False leaves the backbone without weights; `from_pretrained` fills it.
 
     Raises:
@@ -39,7 +40,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     config_class = FrozenViTChunkConfig
     name = "frozen_vit"
 
-    def __init__(self, config: FrozenViTChunkConfig, *, load_backbone: bool = True, **kwargs: Any):
+    def __init__(
+        self,
+        config: FrozenViTChunkConfig,
+        *,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        load_backbone: bool = True,
+        **kwargs: Any,
+    ):
         super().__init__(config)
         config.validate_features()
         self.config = config
@@ -55,6 +63,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.n_regressed = len(config.action_names) - 1
         self.translation_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size * self.n_regressed)
         self.gripper_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size)
+
+        self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
+        self.register_buffer("feature_std", torch.ones(spec.feature_dim))
+        if load_backbone and config.standardize_features:
+            self._take_statistics(dataset_stats or {})
 
         self.register_state_dict_post_hook(_drop_backbone)
         self.register_load_state_dict_post_hook(_excuse_backbone)
@@ -165,6 +178,16 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.backbone.model.load_state_dict(state)
         config.backbone_source, config.backbone_sha256 = source, state_sha256(state)
 
+    def _take_statistics(self, dataset_stats: dict[str, dict[str, Any]]) -> None:
+        stats = dataset_stats.get(self.config.feature_key)
+        if stats is None:
+            raise ValueError(
+                f"standardize_features needs the statistics of {self.config.feature_key}: train on a feature set, "
+                "which constructskill-encode makes of the data set."
+            )
+        self.feature_mean.copy_(torch.as_tensor(stats["mean"]))
+        self.feature_std.copy_(torch.as_tensor(stats["std"]).clamp(min=1e-6))
+
     def _check_backbone(self, model_file: str) -> None:
         found, recorded = state_sha256(self.backbone.model.state_dict()), self.config.backbone_sha256
         if recorded is None:
@@ -177,7 +200,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         """Return (B, T, A): bounded translations, then the gripper's logit (or regressed number)."""
-        inputs = self._features(batch)
+        inputs = (self._features(batch) - self.feature_mean) / self.feature_std
         if self.config.use_state:
             inputs = torch.cat([inputs, batch[OBS_STATE]], dim=-1)
         regressed = self.translation_head(inputs).unflatten(-1, (self.config.chunk_size, self.n_regressed))

