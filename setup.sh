@@ -18,8 +18,6 @@ die() { printf 'setup: error: %s\n' "$*" >&2; exit 1; }
 
 # --- system packages -------------------------------------------------------------------------------------------
 
-has_gpu() { command -v nvidia-smi >/dev/null && nvidia-smi -L >/dev/null 2>&1; }
-
 installed_version() { dpkg-query -W -f '${db:Status-Abbrev} ${Version}' "$1" 2>/dev/null | awk '$1 == "ii" {print $2}'; }
 
 candidate_version() { LC_ALL=C apt-cache policy "$1" 2>/dev/null | awk '/Candidate:/ && $2 != "(none)" {print $2}'; }
@@ -120,30 +118,24 @@ install_lavapipe() {
     elif [[ $(os_release ID) == debian ]] && add_backports "$codename"; then
         apt_install -t "$codename-backports" mesa-vulkan-drivers
     fi
-    new_enough "$(installed_version mesa-vulkan-drivers)" || warn "the simulator cannot render on this machine:" \
+    new_enough "$(installed_version mesa-vulkan-drivers)" || warn "the simulator cannot render without a GPU:" \
         "it needs mesa-vulkan-drivers >= $MESA_MINIMUM and $(os_release PRETTY_NAME) offers" \
         "$(candidate_version mesa-vulkan-drivers); upgrade the system, or add a package source of your choice that has it."
 }
 
-# Packages of every machine; a GPU brings its own Vulkan driver, all others need Mesa's.
-system_packages() {
-    echo libvulkan1 libx11-6 ffmpeg
-    has_gpu || echo mesa-vulkan-drivers
-}
+# Mesa goes on machines with a GPU too: a container without the driver's graphics part renders on the CPU.
+PACKAGES=(libvulkan1 libx11-6 ffmpeg mesa-vulkan-drivers)
 
 system_is_ready() {
-    local packages
-    read -r -d '' -a packages < <(system_packages) || true
-    [[ -z "$(missing_packages "${packages[@]}")" ]] || return 1
-    has_gpu || new_enough "$(installed_version mesa-vulkan-drivers)"
+    [[ -z "$(missing_packages "${PACKAGES[@]}")" ]] && new_enough "$(installed_version mesa-vulkan-drivers)"
 }
 
 setup_system() {
     system_is_ready && return 0
     if ! command -v apt-get >/dev/null; then
-        warn "no apt-get here: install a Vulkan loader, FFmpeg and, without an NVIDIA GPU, Mesa's lavapipe >= $MESA_MINIMUM yourself."
+        warn "no apt-get here: install a Vulkan loader, FFmpeg and Mesa's lavapipe >= $MESA_MINIMUM yourself."
     elif ! can_be_root; then
-        warn "neither root nor sudo: ask the administrator for \`apt-get install $(system_packages | xargs)\`" \
+        warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]}\`" \
             "(mesa-vulkan-drivers >= $MESA_MINIMUM; Debian 12 has it in its backports); going on without."
     else
         install_system
@@ -152,11 +144,11 @@ setup_system() {
 
 install_system() {
     local packages
-    say "installing system packages: $(system_packages | xargs)"
+    say "installing system packages: ${PACKAGES[*]}"
     as_root apt-get update -qq || warn "apt-get update failed; trying with the package lists there are."
     read -r -d '' -a packages < <(missing_packages libvulkan1 libx11-6 ffmpeg) || true
     [[ ${#packages[@]} -eq 0 ]] || apt_install "${packages[@]}" || warn "apt-get could not install: ${packages[*]}"
-    has_gpu || install_lavapipe || warn "apt-get could not install mesa-vulkan-drivers; the simulator will not render."
+    install_lavapipe || warn "apt-get could not install mesa-vulkan-drivers; the simulator renders on a GPU alone."
 }
 
 # --- Python ----------------------------------------------------------------------------------------------------

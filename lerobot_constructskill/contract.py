@@ -6,6 +6,7 @@ as privileged state.
 """
 
 from dataclasses import dataclass
+from math import pi
 
 FPS = 20
 """Control rate in Hz: ManiSkill's default, and the frame rate of every data set."""
@@ -20,6 +21,9 @@ GRIPPER_OPEN, GRIPPER_CLOSED = 1.0, -1.0
 
 TRANSLATION = ("dx", "dy", "dz")
 """End-effector displacement asked for in one step, in metres, in the robot's base frame."""
+
+ROTATION = ("droll", "dpitch", "dyaw")
+"""End-effector rotation asked for in one step, in radians."""
 
 GRIPPER = "gripper"
 """Last action channel: +1 open, -1 closed."""
@@ -71,8 +75,8 @@ class Camera:
 CAMERAS = {
     camera.name: camera
     for camera in (
-        Camera("base", fov=1.5707963267948966, eye=(-1.0, -1.3, 0.9), target=(0.0, -0.35, 0.2)),
-        Camera("wrist", fov=1.5707963267948966, eye=(0.0464982, -0.0200011, 0.0360011), mount="panda_hand"),
+        Camera("base", fov=pi / 2, eye=(-1.0, -1.3, 0.9), target=(0.0, -0.35, 0.2)),
+        Camera("wrist", fov=pi / 2, eye=(0.0464982, -0.0200011, 0.0360011), mount="panda_hand"),
     )
 }
 

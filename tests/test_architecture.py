@@ -20,13 +20,12 @@ ARROWS = {
     "sim": ("contract",),
     "envs": ("contract",),
     "plugin": ("envs", "policies"),
+    "staging": (),
     "demos": ("contract",),
     "demos.demonstrate": ("contract", "envs"),
-    "demos.recorder": ("contract", "envs"),
-    "features": ("contract", "policies"),
-    "study": ("contract", "features", "policies"),
-    "study.rollout": ("contract", "envs", "policies"),
-    "scripts": ("contract", "plugin", "policies", "sim", "envs", "demos", "features", "study"),
+    "demos.recorder": ("contract", "envs", "staging"),
+    "features": ("contract", "policies", "staging"),
+    "scripts": ("contract", "plugin", "policies", "sim", "envs", "demos", "features"),
 }
 # Arrows of functions: the simulator is born on first use.
 LAZY_ARROWS = {"envs": ("sim",)}
@@ -34,7 +33,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 # Files that name every package they may import.
 EXTERNALS = {
     "contract": set(),
-    "study.stats": {"numpy", "scipy", "statsmodels"},
+    "staging": set(),
 }
 
 
@@ -117,21 +116,14 @@ def test_listed_externals_only(module: str) -> None:
     assert names <= EXTERNALS[row(module, EXTERNALS)] | set(sys.stdlib_module_names)
 
 
-def test_report_needs_neither_torch_nor_more_than_stats() -> None:
-    for module in (f"{PACKAGE}.study.stats", f"{PACKAGE}.study.report"):
-        found = {found.target for found in imports(SOURCES[module])} if module in SOURCES else set()
-        assert {target for target in found if is_ours(target)} <= {f"{PACKAGE}.study.stats"}
-        assert not {"torch", "lerobot"} & {target.split(".")[0] for target in found}
-
-
-def test_only_rollout_meets_environments_and_policies() -> None:
+def test_no_room_meets_environments_and_policies() -> None:
     rooms = {
         module: {room(found.target) for found in imports(path) if is_ours(found.target)}
         for module, path in SOURCES.items()
-        if room(module) in ("study", "demos", "features", "envs", "policies")
+        if room(module) in ("demos", "features", "envs", "policies")
     }
     both = {module for module, met in rooms.items() if {"envs", "policies"} <= met | {room(module)}}
-    assert both <= {f"{PACKAGE}.study.rollout"}
+    assert not both
 
 
 @pytest.mark.parametrize("module", [module for module, path in SOURCES.items() if path.name == "__init__.py"])

@@ -87,12 +87,12 @@ class ExpertConfig:
     """
 
     gain: float = 1.0
-    max_step: float = 0.03
-    load_max_step: float = 0.04
+    max_step: float = 0.012
+    load_max_step: float = 0.035
     compliance: float = 0.001
     threshold: float = 0.02
     align_tolerance: float = 0.006
-    grasp_dwell: int = 15
+    grasp_dwell: int = 10
     release_dwell: int = 20
     pregrasp_clearance: float = 0.15
     lift_height: float = 0.40
@@ -101,7 +101,7 @@ class ExpertConfig:
 
     def __post_init__(self):
         for name in ("gain", "max_step", "load_max_step", "threshold", "align_tolerance"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"The expert's {name} must be above 0, not {getattr(self, name)}.")
         for name in ("grasp_dwell", "release_dwell"):
             if getattr(self, name) < 1:

@@ -13,7 +13,7 @@ class NoiseConfig:
 
     Args:
         sigma: standard deviation per axis, in metres; 0 turns noise off.
-        clip: bound on each axis of the executed translation, in metres. It limits what is executed, not the noise.
+        clip: bound on each axis of the executed translation, in metres, with and without noise.
         phases: names of the phases that are perturbed. GRASP and RELEASE stay clean, so that contact is not.
 
     Raises:
@@ -25,9 +25,9 @@ class NoiseConfig:
     phases: list[str] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
 
     def __post_init__(self):
-        if self.sigma < 0:
+        if not 0 <= self.sigma < np.inf:
             raise ValueError(f"Noise sigma must be 0 or more metres, not {self.sigma}.")
-        if self.clip <= 0:
+        if not self.clip > 0:
             raise ValueError(f"Noise clip must be above 0 metres, not {self.clip}.")
         unknown = [phase for phase in self.phases if phase not in list(Phase)]
         if unknown:
@@ -44,8 +44,7 @@ def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.rando
     Returns:
         (n,) float32; the translation perturbed and clipped, every other channel unchanged.
     """
-    noise = rng.normal(0.0, config.sigma, size=3) if config.sigma else np.zeros(3)
+    noise = rng.normal(0.0, config.sigma, size=3) * (phase in config.phases)
     executed = action.copy()
-    if phase in config.phases and config.sigma:
-        executed[:3] = np.clip(action[:3] + noise, -config.clip, config.clip)
+    executed[:3] = np.clip(action[:3] + noise, -config.clip, config.clip)
     return executed

@@ -12,8 +12,8 @@ GRAVITY = 9.81  # m/s2
 ABOVE_TOP = 0.02
 """Height over the object's top at which the jaws wait to be aligned, in metres."""
 
-FINGERS_AROUND = -0.005
-"""Depth of the TCP under the object's top at which the fingers, which reach 9 mm further, are around it, in metres."""
+AROUND = 0.005
+"""Height of the TCP over the object's top from which down the finger tips, 9 mm below it, are around the object."""
 
 PHASES = tuple(Phase)
 GRIPPER = {
@@ -84,7 +84,7 @@ class PickPlaceExpert:
             return target
         top = target[2] + self.config.finger_depth
         misaligned = abs((target - state.tcp) @ state.jaw_axis)
-        if misaligned < self.config.align_tolerance or state.tcp[2] < top - FINGERS_AROUND:
+        if misaligned < self.config.align_tolerance or state.tcp[2] < top + AROUND:
             return target
         return np.array([*target[:2], top + ABOVE_TOP])
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +11,7 @@ from tqdm import tqdm
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, OBS_TYPES, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.staging import staged
 
 
 @dataclass(frozen=True)
@@ -68,26 +68,18 @@ class Summary:
 
 
 def record(config: GenerateConfig) -> Summary:
-    """Write the data set of `config`; an interrupted run leaves only `<root>.partial`, which the next one removes.
+    """Write the data set of `config`; an interrupted run leaves no data set, and the next one starts clean.
 
     Raises:
-        FileExistsError: the root exists already.
-        RuntimeError: more attempts failed than `max_failures` allows.
+        FileExistsError: the root exists already, or another process is writing it.
+        ValueError: more attempts failed than `max_failures` allows.
+        OSError: this machine cannot render.
     """
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     root = Path(config.root) if config.root else HF_LEROBOT_HOME / config.repo_id
-    if root.exists():
-        raise FileExistsError(f"The output folder {root} exists already; name another --root or remove it.")
-    partial = root.with_name(root.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    try:
-        summary = _record_into(config, partial, root)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    partial.rename(root)
-    return summary
+    with staged(root) as folder:
+        return _record_into(config, folder, root)
 
 
 def _record_into(config: GenerateConfig, folder: Path, root: Path) -> Summary:
@@ -149,7 +141,7 @@ def _create_dataset(config: GenerateConfig, folder: Path):
 
 def _check_failures(config: GenerateConfig, discarded: list[int]) -> None:
     if len(discarded) > config.max_failures * config.episodes:
-        raise RuntimeError(
+        raise ValueError(
             f"{len(discarded)} attempts failed, more than max_failures={config.max_failures} allows for "
             f"{config.episodes} demonstrations: check the expert's and the noise's values."
         )

@@ -26,7 +26,7 @@ class ConstructSkillEnvConfig(EnvConfig):
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
             Training and evaluation should see the same robot.
-        render_backend: "auto", or ManiSkill's "gpu" or "cpu".
+        render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
     """
 
     task: str = "brick_to_bin"
@@ -39,6 +39,8 @@ class ConstructSkillEnvConfig(EnvConfig):
     def __post_init__(self):
         if self.max_parallel_tasks != 1:
             raise ValueError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+        if self.fps != FPS:
+            raise ValueError(f"fps must be {FPS}, the control rate of every task, not {self.fps}.")
         row = get_task(self.task)
         self._make_env()  # refuses what no environment can be made with
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(row.action_names),))}

@@ -8,18 +8,23 @@ from gymnasium import spaces
 
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
-    CAMERAS,
     FPS,
+    GRIPPER,
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
     IMAGE_SIZE,
     OBS_TYPES,
+    ROTATION,
     STATE_NAMES,
+    TRANSLATION,
     get_task,
 )
 
-MANISKILL_CHANNELS = ("dx", "dy", "dz", "drx", "dry", "dyaw", "gripper")
+MANISKILL_CHANNELS = (*TRANSLATION, *ROTATION, GRIPPER)
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
+
+
+RENDER_BACKENDS = ("auto", "gpu", "cpu")
 
 
 class ConstructSkillEnv(gym.Env):
@@ -39,10 +44,10 @@ class ConstructSkillEnv(gym.Env):
         obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
-        render_backend: ManiSkill's, or "auto": the GPU if there is one, else the CPU.
+        render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
 
     Raises:
-        ValueError: no such task or obs_type, or an episode_length below 1.
+        ValueError: no such task, obs_type or render_backend, or an episode_length below 1.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -59,6 +64,10 @@ class ConstructSkillEnv(gym.Env):
         self._row = get_task(task)
         if obs_type not in OBS_TYPES:
             raise ValueError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
+        if render_backend not in RENDER_BACKENDS:
+            raise ValueError(
+                f"Unknown render_backend '{render_backend}'; choose one of: {', '.join(RENDER_BACKENDS)}."
+            )
         if episode_length is not None and episode_length < 1:
             raise ValueError(f"episode_length must be at least 1 step, not {episode_length}.")
         self.task = task
@@ -165,7 +174,7 @@ class ConstructSkillEnv(gym.Env):
             raise ValueError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
         scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
         for name, value in zip(names, action, strict=True):
-            scaled[MANISKILL_CHANNELS.index(name)] = value if name == "gripper" else value / ACTION_SCALE
+            scaled[MANISKILL_CHANNELS.index(name)] = value if name == GRIPPER else value / ACTION_SCALE
         return np.clip(scaled, -1, 1)
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
@@ -178,6 +187,3 @@ class ConstructSkillEnv(gym.Env):
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
         return {"is_success": bool(info["success"][0]), **booleans}
-
-
-assert all(camera in CAMERAS for cameras in OBS_TYPES.values() for camera in cameras)

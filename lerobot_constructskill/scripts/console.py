@@ -10,12 +10,12 @@ import draccus
 def run[Config](config_class: type[Config], action: Callable[[Config], str]) -> None:
     """Parse `config_class` from the command line and print what `action` returns; exit with 1 if it refuses.
 
-    A `ValueError`, `OSError` or `RuntimeError` is the user's to read and is printed without a traceback; any other
-    exception is a defect of ours and keeps it.
+    A `ValueError` or `OSError` is the user's to read and is printed without a traceback; any other exception is a
+    defect and keeps it.
     """
     try:
         print(action(_parse(config_class)))
-    except (ValueError, OSError, RuntimeError) as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"{Path(sys.argv[0]).stem}: {' '.join(str(error).split())}")
     except KeyboardInterrupt:
         sys.exit(130)

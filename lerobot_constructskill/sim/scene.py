@@ -13,6 +13,7 @@ from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
 from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
 from lerobot_constructskill.contract import (
@@ -44,10 +45,18 @@ FINGER_OPEN = 0.038
 PLACED_STEPS = 5
 """Consecutive steps inside the bin, gripper open, that make a placement (paper, section III)."""
 
-NO_DEVICE = ("vk::", "Vulkan", "rendering device", "physical device")
-"""Words of SAPIEN's errors where there is nothing to render with."""
+NO_DEVICE = ("vk::", "vulkan", "rendering device", "physical device")
+"""What SAPIEN's errors say, in lower case, where there is nothing to render with."""
 
 HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
+
+
+def best_render_backend() -> str:
+    """ManiSkill's "gpu" where a GPU can render, else "cpu"."""
+    try:
+        return "gpu" if sapien.Device("cuda").can_render() else "cpu"
+    except RuntimeError:
+        return "cpu"
 
 
 class PickPlaceEnv(BaseEnv):
@@ -55,6 +64,8 @@ class PickPlaceEnv(BaseEnv):
     **Task Description:**
     Pick an object from the ground and place it in an open-topped bin. A task overrides `_load_object` and the
     four geometry constants below.
+
+    The default distribution turns the object all the way round; an expert for it needs the rotation channels.
 
     **Randomizations:**
     - The object's centre is uniform within `spawn_range` of `object_center` in x and y.
@@ -68,7 +79,11 @@ class PickPlaceEnv(BaseEnv):
     Args:
         cameras: names of the cameras in `contract.CAMERAS` to observe with; the paper's sole view by default.
         light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
-        render_backend: ManiSkill's, or "auto": the GPU if there is one, else Mesa's lavapipe.
+        robot_uids: ManiSkill's; the Panda by default, drawn as `light_robot` says.
+        render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
+
+    Raises:
+        OSError: there is no Vulkan device to render with.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
     environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
@@ -92,32 +107,36 @@ class PickPlaceEnv(BaseEnv):
         *args,
         cameras: tuple[str, ...] = OBS_TYPES["pixels"],
         light_robot: bool | None = None,
+        robot_uids: str | None = None,
         control_mode: str = "pd_ee_delta_pose",
         render_backend: str = "auto",
         **kwargs,
     ):
         if render_backend == "auto":
-            render_backend = "gpu" if torch.cuda.is_available() else "cpu"
+            render_backend = best_render_backend()
         self.cameras = tuple(cameras)
         self.light_robot = render_backend in ("cpu", "sapien_cpu") if light_robot is None else light_robot
+        if robot_uids is None:
+            robot_uids = LightPanda.uid if self.light_robot else "panda"
         try:
             super().__init__(
                 *args,
-                robot_uids=LightPanda.uid if self.light_robot else "panda",
+                robot_uids=robot_uids,
                 control_mode=control_mode,
                 render_backend=render_backend,
-                sim_config={"control_freq": FPS},
                 **kwargs,
             )
         except RuntimeError as error:
-            if not any(
-                word in str(error).lower() for word in ("vk::", "vulkan", "rendering device", "physical device")
-            ):
+            if not any(word in str(error).lower() for word in NO_DEVICE):
                 raise
-            raise RuntimeError(
+            raise OSError(
                 f"No Vulkan device to render with ({error}); `make setup` installs Mesa's software renderer and "
                 "`constructskill-doctor` tells what is missing."
             ) from None
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        return SimConfig(control_freq=FPS)
 
     # What a task declares
 

@@ -25,8 +25,16 @@ _CREASE_ANGLE = np.radians(40)
 
 
 def cache_folder() -> Path:
-    """Folder for files that can be made again: `$XDG_CACHE_HOME/constructskill`, or the same under `~/.cache`."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "constructskill"
+    """Folder for files that can be made again: `$XDG_CACHE_HOME` or `~/.cache`, else one of this user's in /tmp."""
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    for folder in (Path(home) / "constructskill", Path(tempfile.gettempdir()) / f"constructskill-{os.getuid()}"):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=folder).close()
+        except OSError:
+            continue
+        return folder
+    raise OSError("Neither ~/.cache nor the temporary folder can be written; set XDG_CACHE_HOME to one that can.")
 
 
 def light_panda_urdf() -> str:
@@ -38,7 +46,6 @@ def light_panda_urdf() -> str:
     key = hashlib.sha256(f"{LIGHT_TRIANGLES} {_CREASE_ANGLE} {source}".encode() + source.read_bytes()).hexdigest()[:16]
     folder = cache_folder() / f"panda_light_{key}"
     if not folder.exists():
-        folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
             built = Path(scratch) / "panda"
             _build_light_panda(source, built)

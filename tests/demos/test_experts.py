@@ -1,7 +1,9 @@
 """Experts and noise: pure functions, checked as such, and experts that must succeed on the real simulator."""
 
 from dataclasses import fields
+from pathlib import Path
 
+import draccus
 import numpy as np
 import pytest
 
@@ -9,8 +11,10 @@ from lerobot_constructskill.contract import DEMO_SEED_START, GRIPPER_OPEN, SIM_S
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
+from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
+CONFIGS = Path(__file__).parents[2] / "configs" / "generate"
 NO_NOISE = NoiseConfig(sigma=0.0)
 
 
@@ -59,14 +63,22 @@ def test_the_expert_stays_above_an_object_it_is_not_over():
     assert expert.act(beside, progress)[0][2] > 0 and expert.act(beside, progress)[0][1] < 0
 
 
-@pytest.mark.parametrize("bad", [{"gain": 0}, {"max_step": -1}, {"threshold": 0}, {"grasp_dwell": 0}])
+@pytest.mark.parametrize(
+    "bad", [{"gain": float("nan")}, {"gain": 0}, {"max_step": -1}, {"threshold": 0}, {"grasp_dwell": 0}]
+)
 def test_impossible_experts_are_refused(bad):
     with pytest.raises(ValueError, match=next(iter(bad))):
         ExpertConfig(**bad)
 
 
 @pytest.mark.parametrize(
-    "bad, word", [({"sigma": -0.01}, "-0.01"), ({"clip": 0}, "clip"), ({"phases": ["LFT"]}, "LIFT")]
+    "bad, word",
+    [
+        ({"sigma": -0.01}, "-0.01"),
+        ({"sigma": float("nan")}, "sigma"),
+        ({"clip": 0}, "clip"),
+        ({"phases": ["LFT"]}, "LIFT"),
+    ],
 )
 def test_impossible_noise_is_refused(bad, word):
     with pytest.raises(ValueError, match=word):
@@ -107,6 +119,18 @@ def test_every_expert_succeeds_in_nine_of_ten_noisy_attempts(env):
     expert = make_expert(TASKS[env.task], ExpertConfig())
     outcomes = [demonstrate(env, expert, NoiseConfig(), DEMO_SEED_START + i)[1] for i in range(10)]
     assert sum(outcomes) >= 9
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("name, frames", [("paper", 462), ("paper_noise_free", 430)])
+def test_the_papers_set_is_as_long_as_the_paper_says(name, frames):
+    config = draccus.parse(GenerateConfig, CONFIGS / f"{name}.yaml", args=["--repo_id=local/paper"])
+    env = ConstructSkillEnv(config.task, config.obs_type, config.max_steps)
+    attempt, success = demonstrate(
+        env, make_expert(TASKS[config.task], config.expert), config.noise, config.seed_start
+    )
+    env.close()
+    assert success and len(attempt) == pytest.approx(frames, rel=0.25)
 
 
 @pytest.mark.sim

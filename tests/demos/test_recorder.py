@@ -88,7 +88,7 @@ def test_failed_attempts_are_discarded_and_end_a_hopeless_run_with_nothing_left(
     config = GenerateConfig(
         "local/none", str(tmp_path / "none"), episodes=2, max_steps=60, max_failures=0.5, expert=NEVER
     )
-    with pytest.raises(RuntimeError, match="2 attempts failed"):
+    with pytest.raises(ValueError, match="2 attempts failed"):
         record(config)
     assert list(tmp_path.iterdir()) == []
 
@@ -121,7 +121,7 @@ def test_the_command_answers_bad_input_in_one_sentence(flags, words, tmp_path):
 def test_a_killed_generation_leaves_no_data_set_and_the_next_one_is_whole(tmp_path):
     root = tmp_path / "set"
     killed = generate(root, "--episodes=50")
-    data = root.with_name("set.partial") / "data"
+    data = root.with_name("set.partial") / "dataset" / "data"
     while not data.exists():
         assert killed.poll() is None, killed.communicate()
         time.sleep(0.2)

@@ -82,7 +82,28 @@ def test_initial_states_vary_exactly_where_the_task_says_so(blind):
     assert (np.ptp(offsets, axis=0) > blind.spawn_range / 2).all() or blind.spawn_range == 0
 
 
-def test_an_episode_does_not_depend_on_its_batch():
+def test_the_object_is_set_down_where_and_as_turned_as_was_drawn():
+    env = make("brick_to_bin")
+    env.spawn_range, env.yaw_range = PickPlaceEnv.spawn_range, PickPlaceEnv.yaw_range
+    for seed in range(4):
+        env.reset(seed=seed)
+        dx, dy, dyaw = env._spawn_offsets(BatchedRNG.from_seeds([seed], backend="numpy:random_state"))[0]
+        w, x, y, z = env.object.pose.q[0].numpy()
+        expected = [*(np.array(env.object_center) + [dx, dy]), env.object_size[2] / 2]
+        np.testing.assert_allclose(env.object.pose.p[0].numpy(), expected, atol=1e-6)
+        assert (x, y) == (0, 0) and np.isclose(np.arctan2(z, w) * 2, dyaw, atol=1e-5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="several environments in one need a GPU")
+def test_an_episode_is_the_same_alone_and_in_a_batch_on_the_gpu():
+    batch = make("block_to_bin", num_envs=3, sim_backend="physx_cuda")
+    batch.reset(seed=[3, 4, 5])
+    alone = make("block_to_bin")
+    alone.reset(seed=4)
+    torch.testing.assert_close(batch.object.pose.p[1].cpu(), alone.object.pose.p[0])
+
+
+def test_an_episodes_draw_does_not_depend_on_its_batch():
     draw = PickPlaceEnv._spawn_offsets
     batch = draw(PickPlaceEnv, BatchedRNG.from_seeds([3, 4, 5], backend="numpy:random_state"))
     alone = draw(PickPlaceEnv, BatchedRNG.from_seeds([4], backend="numpy:random_state"))

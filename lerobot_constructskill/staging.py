@@ -1,0 +1,40 @@
+"""A folder that appears whole or not at all, however the process that writes it ends. Standard library only."""
+
+import fcntl
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+MARK = ".constructskill"
+"""File that tells our working folders from a user's, and that the process at work holds locked."""
+
+
+@contextmanager
+def staged(root: Path) -> Iterator[Path]:
+    """Yield a path to write a folder to; it becomes `root` when the block ends, and is removed if the block fails.
+
+    The path lies in `<root>.partial`. What a killed process left there is removed first.
+
+    Raises:
+        FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
+    """
+    if root.exists():
+        raise FileExistsError(f"The output folder {root} exists already; remove it or name another.")
+    partial = root.with_name(root.name + ".partial")
+    mark = partial / MARK
+    if partial.exists() and not mark.exists():
+        raise FileExistsError(f"{partial} is in the way and not from an interrupted run; move it away.")
+    partial.mkdir(parents=True, exist_ok=True)
+    with mark.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise FileExistsError(f"Another process is writing {root} at this moment.") from None
+        try:
+            folder = partial / "dataset"
+            shutil.rmtree(folder, ignore_errors=True)
+            yield folder
+            folder.rename(root)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)

@@ -1,0 +1,44 @@
+"""Every shipped YAML is read by the class it is for, and says what it claims to say."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import draccus
+import pytest
+from lerobot.configs.train import TrainPipelineConfig
+
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.demos.recorder import GenerateConfig
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
+TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
+
+
+def generate_config(path: Path) -> GenerateConfig:
+    return draccus.parse(GenerateConfig, path, args=["--repo_id=local/set"])
+
+
+@pytest.mark.parametrize("path", GENERATE, ids=lambda path: path.stem)
+def test_generation_configs_are_the_papers(path):
+    config = generate_config(path)
+    assert (config.task, config.episodes) == ("brick_to_bin", 80)
+    assert config.noise.sigma == (0.0 if path.stem.endswith("noise_free") else 0.01)
+
+
+@pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
+def test_a_noise_free_twin_differs_in_its_noise_alone(path):
+    twin = generate_config(path.with_stem(path.stem.removesuffix("_noise_free")))
+    config = generate_config(path)
+    assert replace(config, noise=twin.noise) == twin
+
+
+@pytest.mark.parametrize("path", TRAIN, ids=lambda path: path.stem)
+def test_training_configs_hold_out_every_eighth_episode_and_no_other(path):
+    config = draccus.parse(TrainPipelineConfig, path, args=[])
+    episodes = config.dataset.episodes
+    n_held_out = math.ceil(len(episodes) * config.dataset.eval_split)
+    assert sorted(episodes) == list(range(len(episodes)))
+    assert episodes[-n_held_out:] == [i for i in range(len(episodes)) if i % 8 == 7]
+    assert config.eval_steps == config.steps
