@@ -14,7 +14,7 @@ demo: setup ## demonstrations, training, evaluation and a video, end to end
 	@examples/demo.sh
 
 ten-seeds: setup ## ten training seeds of frozen_vit on the fast set, lift and place counts per seed
-	@OUT=outputs/fast EPISODES=80 SEEDS="0 1 2 3 4 5 6 7 8 9" TRAIN=frozen_vit_fast examples/demo.sh
+	@SEEDS="0 1 2 3 4 5 6 7 8 9" examples/demo.sh
 
 test: setup ## every test
 	$(PARALLEL)

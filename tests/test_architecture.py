@@ -24,8 +24,8 @@ ARROWS = {
     "demos": ("contract",),
     "demos.demonstrate": ("contract", "envs"),
     "demos.recorder": ("contract", "envs", "staging"),
-    "features": ("contract", "policies", "staging"),
-    "scripts": ("contract", "plugin", "policies", "sim", "envs", "demos", "features"),
+    "features": ("contract", "policies"),
+    "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features"),
 }
 # Arrows of functions: the simulator is born on first use.
 LAZY_ARROWS = {"envs": ("sim",)}

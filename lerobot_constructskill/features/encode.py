@@ -1,7 +1,6 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
 import hashlib
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,8 +20,6 @@ from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
-
-PARTIAL_MARK = ".constructskill-encode"
 
 
 def load_encoder(
@@ -68,63 +65,26 @@ def encode_frames(dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, 
 
 
 def write_feature_set(
-    dataset: LeRobotDataset, camera: str, features: np.ndarray, info: dict[str, str], repo_id: str, root: Path
-) -> LeRobotDataset:
+    dataset: LeRobotDataset, camera: str, features: np.ndarray, info: dict[str, str], repo_id: str, folder: Path
+) -> None:
     """Write a copy of `dataset` with `features` (N, D) in place of its images.
 
     Indices, episodes, tasks, actions and other observations stay as they are; columns that no policy reads are left
-    out, because LeRobot's loader takes time for each. The copy appears under `root` when it is complete; until then
-    it stands in `<root>.partial`.
-
-    Raises:
-        FileExistsError: `root` exists.
+    out, because LeRobot's loader takes time for each.
     """
-    partial = claim(root)
     key = feature_key(camera)
     info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
     column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}
-    staged = partial / "dataset"
-    copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), staged, repo_id)
+    copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), folder, repo_id)
     stats = compute_episode_stats({key: features}, {key: column})
-    write_stats({**(copy.meta.stats or {}), **stats}, staged)
-    _forget_videos(staged)
-    staged.rename(root)
-    shutil.rmtree(partial)
-    return LeRobotDataset(repo_id, root=root)
+    write_stats({**(copy.meta.stats or {}), **stats}, folder)
+    _forget_videos(folder)
 
 
 def _left_out(dataset: LeRobotDataset) -> list[str]:
     read = [name for name in dataset.meta.features if name.startswith(("observation.", "action"))]
     kept = set(read) - set(dataset.meta.camera_keys) | set(DEFAULT_FEATURES)
     return [name for name in dataset.meta.features if name not in kept]
-
-
-def partial_of(root: Path) -> Path:
-    return root.with_name(root.name + ".partial")
-
-
-def refuse_existing(root: Path) -> None:
-    """Raise FileExistsError if `root` exists, or a `<root>.partial` that this command did not make."""
-    if root.exists():
-        raise FileExistsError(f"'{root}' exists already: remove it or choose another --out_root.")
-    partial = partial_of(root)
-    if partial.exists() and not (partial / PARTIAL_MARK).exists():
-        raise FileExistsError(f"'{partial}' is in the way and not from an interrupted encoding: move it away.")
-
-
-def claim(root: Path) -> Path:
-    """Make `<root>.partial` for this run, in place of one that an interrupted run left.
-
-    Raises:
-        FileExistsError: `root` exists, or a `<root>.partial` that this command did not make.
-    """
-    refuse_existing(root)
-    partial = partial_of(root)
-    if partial.exists():
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    (partial / PARTIAL_MARK).touch()
-    return partial
 
 
 def data_sha256(root: Path) -> str:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.staging import staged
 
 
 @dataclass
@@ -33,28 +34,24 @@ def encode(config: EncodeConfig) -> Path:
         ValueError: unknown backbone, precision or camera, or damaged weights.
         FileExistsError: the output folder exists.
         FileNotFoundError: the data set or the backbone's weights cannot be had.
+        OSError: the output folder cannot be written, which shows before anything is encoded.
     """
     from lerobot.datasets import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
-    from lerobot_constructskill.features.encode import (
-        encode_frames,
-        load_encoder,
-        refuse_existing,
-        write_feature_set,
-    )
+    from lerobot_constructskill.features.encode import encode_frames, load_encoder, write_feature_set
 
     if config.batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
-    refuse_existing(out_root)
-    encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
-    encoder.to(config.device or auto_select_torch_device())
-    dataset = LeRobotDataset(config.repo_id, root=config.root)
-    features = encode_frames(dataset, config.camera, encoder, config.batch_size)
-    write_feature_set(dataset, config.camera, features, info, out_repo_id, out_root)
+    with staged(out_root) as folder:
+        encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
+        encoder.to(config.device or auto_select_torch_device())
+        dataset = LeRobotDataset(config.repo_id, root=config.root)
+        features = encode_frames(dataset, config.camera, encoder, config.batch_size)
+        write_feature_set(dataset, config.camera, features, info, out_repo_id, folder)
     return out_root
 
 

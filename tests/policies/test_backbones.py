@@ -3,6 +3,7 @@
 import importlib.util
 import re
 
+import huggingface_hub
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -11,6 +12,8 @@ from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_wheel, state_sha256
+
+THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
 
 
 @pytest.fixture
@@ -29,7 +32,7 @@ def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
         feature = encoder(images)
     assert feature.shape == (2, spec.feature_dim) and feature.dtype == torch.float32
     assert feature.std() > 0 and torch.isfinite(feature).all()
-    assert source == f"local {weights(name)}"
+    assert source == f"local {weights(name).name}"  # published with checkpoints: no home folder in it
     assert state_sha256(encoder.model.state_dict()) == state_sha256(state)
     encoder.train()
     assert not any(module.training for module in encoder.modules())
@@ -82,6 +85,8 @@ def test_damaged_absent_and_foreign_files_get_one_sentence(weights, tmp_path):
         with pytest.raises(error, match=said) as refusal:
             load_weights(spec, str(path))
         assert "\n" not in str(refusal.value)
+        if error is FileNotFoundError:
+            assert all(way in str(refusal.value) for way in THREE_WAYS)
 
 
 def test_weights_with_another_hash_are_refused(weights):
@@ -93,8 +98,35 @@ def test_weights_with_another_hash_are_refused(weights):
 def test_without_a_source_the_three_ways_are_listed(name, no_hub):
     with pytest.raises(FileNotFoundError) as refusal:
         load_weights(BACKBONES[name])
-    for way in ("--policy.backbone_path=", f"hf download {BACKBONES[name].repo_id}", "[offline]"):
-        assert way in str(refusal.value)
+    assert all(way in str(refusal.value) for way in (*THREE_WAYS, BACKBONES[name].repo_id))
+
+
+@pytest.mark.parametrize("error", [OSError("No space left"), RuntimeError("CAS service error"), OSError()])
+def test_a_download_that_fails_is_logged_and_passed_over(error, monkeypatch, caplog):
+    """The Hub is faked: it announces the file and then fails to deliver it."""
+
+    def fail(*args: object, **kwargs: object) -> None:
+        raise error
+
+    monkeypatch.setattr(weights_module, "_on_hub", lambda backbone: (None, "model.safetensors"))
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", fail)
+    with pytest.raises(FileNotFoundError, match="No weights for vit_tiny16"):
+        load_weights(BACKBONES["vit_tiny16"])
+    assert f"({str(error) or 'OSError'})" in caplog.text
+
+
+def test_where_a_path_is_gone_known_weights_come_from_elsewhere(weights, monkeypatch, caplog):
+    """The Hub is faked by a local file."""
+    spec, file = BACKBONES["vit_tiny16"], weights("vit_tiny16") / "model.safetensors"
+    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: file)
+    sha256 = state_sha256(load_file(file))
+    _, source = load_weights(spec, "/home/trainer/gone", sha256)
+    assert source.startswith("hub ") and "'/home/trainer/gone' does not exist" in caplog.text
+    with pytest.raises(FileNotFoundError, match="no weights file '/home/trainer/gone'"):
+        load_weights(spec, "/home/trainer/gone")
+    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: None)
+    with pytest.raises(FileNotFoundError, match="'/home/trainer/gone' does not exist: give a local copy"):
+        load_weights(spec, "/home/trainer/gone", sha256)
 
 
 def test_without_hub_and_wheel_dinov2_lists_the_three_ways(no_hub, monkeypatch):

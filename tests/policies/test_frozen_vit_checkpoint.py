@@ -9,6 +9,7 @@ import torch
 from lerobot.policies import factory
 from safetensors.torch import load_file, load_model, save_file
 
+from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 
@@ -37,7 +38,7 @@ def test_a_loaded_checkpoint_acts_the_same(save_backbone, make_policy, local_wei
         torch.testing.assert_close(loaded.select_action(batch), policy.select_action(batch))
         policy.reset()
     assert loaded.config.backbone_sha256 == policy.config.backbone_sha256
-    assert loaded.config.backbone_source == f"local {local_weights}"
+    assert loaded.config.backbone_source == f"local {local_weights.name}"
     assert "issing key" not in caplog.text
     holds = any("backbone" in name for name in load_file(tmp_path / "checkpoint" / "model.safetensors"))
     assert holds == save_backbone
@@ -61,6 +62,26 @@ def test_a_checkpoint_can_be_fine_tuned_with_the_other_choice(make_policy, image
     again = FrozenViTChunkPolicy.from_pretrained(tmp_path / "whole")
     batch = {"observation.images.base": images}
     torch.testing.assert_close(again.select_action(batch), policy.select_action(batch))
+
+
+def test_a_small_checkpoint_loads_where_its_path_is_gone(make_policy, local_weights, weights, tmp_path, monkeypatch):
+    """The Hub is faked by a local file."""
+    make_policy(save_backbone=False, backbone_path=str(local_weights)).save_pretrained(tmp_path / "checkpoint")
+    shutil.rmtree(local_weights)
+    monkeypatch.setattr(weights_module, "_hub_file", lambda spec: weights("vit_tiny16") / "model.safetensors")
+    loaded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "checkpoint")
+    assert loaded.config.backbone_source.startswith("hub ")
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_another_choice_of_standardising_is_refused(trained, make_policy, tmp_path):
+    stats = {"observation.features.base": {"mean": torch.ones(192), "std": torch.ones(192)}}
+    make_policy(standardize_features=trained, dataset_stats=stats).save_pretrained(tmp_path)
+    FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    edit_config(tmp_path, standardize_features=not trained)
+    with pytest.raises(ValueError, match=f"trained with standardize_features={str(trained).lower()}, but") as refusal:
+        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    assert "\n" not in str(refusal.value)
 
 
 def test_other_backbone_weights_are_refused(make_policy, weights, tmp_path):

