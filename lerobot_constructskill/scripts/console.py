@@ -29,3 +29,5 @@ def _parse[Config](config_class: type[Config]) -> Config:
         while cause.__cause__ is not None:
             cause = cause.__cause__
         raise ValueError(str(cause)) from None
+    except TypeError:  # draccus merges the file's fields with the flags before it looks at them
+        raise ValueError("The file of --config_path is empty or not a mapping of fields.") from None
