@@ -35,9 +35,11 @@ one_seed() {
 export -f one_seed
 
 say "3/4 and 4/4 lerobot-train and lerobot-eval, training seeds $SEEDS (logs in $OUT, some minutes a seed)"
-# One thread a process: those of two processes that share two cores slow each other down many times over.
+# One seed a core and one thread a process: threads of two processes that share two cores stall each other. Asked for
+# before the export, because nproc answers with OMP_NUM_THREADS where that is set.
+CORES=$(nproc)
 export OMP_NUM_THREADS=1
-tr ' ' '\n' <<<"$SEEDS" | xargs -P "$(nproc)" -I{} bash -c 'one_seed {}'
+tr ' ' '\n' <<<"$SEEDS" | xargs -P "$CORES" -I{} bash -c 'one_seed {}'
 
 say "Outcomes per training seed"
 python examples/count_outcomes.py "$OUT"
