@@ -23,7 +23,6 @@ from lerobot_constructskill.contract import (
 MANISKILL_CHANNELS = (*TRANSLATION, *ROTATION, GRIPPER)
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
 
-
 RENDER_BACKENDS = ("auto", "gpu", "cpu")
 
 
@@ -138,17 +137,17 @@ class ConstructSkillEnv(gym.Env):
 
     def privileged_state(self) -> dict[str, np.ndarray]:
         """The simulator's state, `contract.SIM_STATE` name to float32 array."""
-        state = self._ensure_env().unwrapped.privileged_state()
+        state = self._ensure_env().privileged_state()
         return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
 
     def agent_state(self) -> np.ndarray:
         """Proprioception as `contract.STATE_NAMES` names it, (8,) float32."""
-        return self._ensure_env().unwrapped.agent_state()[0].cpu().numpy().astype(np.float32)
+        return self._ensure_env().agent_state()[0].cpu().numpy().astype(np.float32)
 
     @property
     def light_robot(self) -> bool:
         """Whether the robot is drawn with decimated meshes."""
-        return self._ensure_env().unwrapped.light_robot
+        return self._ensure_env().light_robot
 
     # ManiSkill
 

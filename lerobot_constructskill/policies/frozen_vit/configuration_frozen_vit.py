@@ -37,7 +37,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
-        standardize_features: whether the heads see each feature with the training set's mean and deviation taken
+        standardize_features: whether the heads see each feature with the data set's mean and deviation taken
             out. The linear heads can express the same functions either way (the paper's is False), but Adam gets
             there in far fewer samples. Needs a feature set, whose statistics go into the checkpoint; they are
             those that LeRobot computes, of the whole data set, episodes held out for evaluation included.

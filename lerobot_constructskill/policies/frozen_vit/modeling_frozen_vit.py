@@ -30,7 +30,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     Args:
         config: the configuration; the source and hash of the backbone's weights are written into it.
-        dataset_stats: the training set's statistics; those of a feature set serve `standardize_features`.
+        dataset_stats: the data set's statistics as LeRobot keeps them; a feature set's serve `standardize_features`.
         load_backbone: False leaves the backbone without weights; `from_pretrained` fills it.
 
     Raises:
