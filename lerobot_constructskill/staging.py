@@ -1,6 +1,7 @@
-"""A folder that appears whole or not at all, however the process that writes it ends. Standard library only."""
+"""Folders and files that appear whole or not at all, however a process that writes one ends. Standard library only."""
 
 import fcntl
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,3 +39,15 @@ def staged(root: Path) -> Iterator[Path]:
             folder.rename(root)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """Yield a path beside `path` to write a file to; it takes `path`'s place when the block ends, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -25,7 +25,11 @@ ARROWS = {
     "demos.demonstrate": ("contract", "envs"),
     "demos.recorder": ("contract", "envs", "staging"),
     "features": ("contract", "policies"),
-    "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features"),
+    "study.plan": ("contract",),
+    "study.rows": ("staging",),
+    "study.stats": (),
+    "study.report": ("contract", "staging"),
+    "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features", "study"),
 }
 # Arrows of functions: the simulator is born on first use.
 LAZY_ARROWS = {"envs": ("sim",)}
@@ -34,6 +38,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 EXTERNALS = {
     "contract": set(),
     "staging": set(),
+    "study.stats": {"numpy", "pandas", "scipy", "statsmodels"},
 }
 
 
