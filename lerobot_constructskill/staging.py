@@ -43,7 +43,7 @@ def staged(root: Path) -> Iterator[Path]:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
-    """Yield a path beside `path` to write a file to; it takes `path`'s place when the block ends, whole or not at all."""
+    """Yield a path beside `path` to write a file to; it becomes `path` when the block ends, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     try:

@@ -25,6 +25,7 @@ ARROWS = {
     "demos.demonstrate": ("contract", "envs"),
     "demos.recorder": ("contract", "envs", "staging"),
     "features": ("contract", "policies"),
+    "study": (),
     "study.plan": ("contract",),
     "study.rows": ("staging",),
     "study.stats": (),
