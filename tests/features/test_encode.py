@@ -14,6 +14,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.features import encode as features_encode
+from lerobot_constructskill.features.encode import PATCHES, load_encoder
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -120,6 +121,16 @@ def test_features_are_the_policys_own_at_every_frame(source, encoded, weights):
     for before, after in zip(source, encoded, strict=True):
         feature = policy.backbone(before["observation.images.base"][None])[0]
         torch.testing.assert_close(after[KEY], feature, atol=1e-4, rtol=0)
+
+
+def test_patch_features_on_request(source, weights, tmp_path):
+    encode(settings(source, weights, tmp_path / "out", patches=True))
+    patches = np.load(tmp_path / "out" / PATCHES, mmap_mode="r")
+    encoder, _ = load_encoder("vit_tiny16", str(weights))
+    _, expected = encoder.encode(torch.stack([frame["observation.images.base"] for frame in source]))
+    assert patches.shape == (sum(LENGTHS), 196, 192) and patches.dtype == np.float16
+    np.testing.assert_allclose(patches, expected, atol=1e-2)
+    assert len(LeRobotDataset("local/out", root=tmp_path / "out")) == sum(LENGTHS)
 
 
 def test_the_description_travels_with_the_data_set(source, encoded, weights):

@@ -1,5 +1,6 @@
 """Every entry of the registry, with random weights, through the real loading code."""
 
+import copy
 import importlib.util
 import re
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from lerobot_constructskill.policies.frozen_vit import encoder as encoder_module
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
@@ -63,6 +65,32 @@ def test_bfloat16_stays_close_and_returns_float32(weights, images):
         features.append(encoder(images))
     assert features[1].dtype == torch.float32
     assert torch.nn.functional.cosine_similarity(*features).min() > 0.99
+
+
+@pytest.mark.parametrize("name", BACKBONES)
+def test_openvino_encodes_an_image_alike_in_every_batch_and_as_autocast_does(name, weights, monkeypatch):
+    pytest.importorskip("openvino", reason="the extra `cpu` supplies it")
+    encoder = FrozenEncoder(BACKBONES[name], "bfloat16")
+    encoder.model.load_state_dict(load_weights(BACKBONES[name], str(weights(name)))[0])
+    images = torch.rand(3, 3, 224, 224, generator=torch.Generator().manual_seed(0))
+    together, patches = encoder.encode(images)
+    assert encoder.runtime == "openvino"
+    assert torch.equal(together, torch.cat([encoder(image[None]) for image in images]))
+    monkeypatch.setattr(encoder_module.openvino, "is_installed", lambda: False)
+    assert encoder.runtime == "torch"
+    for ours, autocast in zip((together, patches), encoder.encode(images), strict=True):
+        assert (ours - autocast).norm() < 0.02 * autocast.norm()
+
+
+def test_weights_loaded_after_the_first_image_are_the_ones_used(weights, images):
+    spec = BACKBONES["vit_tiny16"]
+    encoder = FrozenEncoder(spec, "bfloat16")
+    features = []
+    for seed in (0, 1, 0):
+        encoder.model.load_state_dict(load_weights(spec, str(weights("vit_tiny16", seed)))[0])
+        features.append(encoder(images))
+    assert torch.equal(features[0], features[2]) and not torch.equal(features[0], features[1])
+    assert torch.equal(copy.deepcopy(encoder)(images), features[0])
 
 
 def test_classifiers_and_text_towers_are_dropped(weights, tmp_path):

