@@ -73,9 +73,9 @@ def encode_frames(
         for images in _batches(dataset, key, batch_size):
             rows = slice(done, done + len(images))
             pooled, tokens = encoder.encode(images.to(device) / 255)
-            features[rows] = pooled.cpu()
+            features[rows] = pooled.cpu().numpy()
             if patches is not None:
-                patch_map[rows] = tokens.cpu()
+                patch_map[rows] = tokens.cpu().numpy()
             done = rows.stop
             progress.update(len(images))
     return features

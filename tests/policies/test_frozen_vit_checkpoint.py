@@ -104,7 +104,7 @@ def truncate(checkpoint: Path) -> None:
 
 def drop_head(checkpoint: Path) -> None:
     state = load_file(checkpoint / "model.safetensors")
-    del state["gripper_head.bias"]
+    del state["heads.gripper.bias"]
     save_file(state, checkpoint / "model.safetensors")
 
 
@@ -118,7 +118,7 @@ def drop_head(checkpoint: Path) -> None:
             FileNotFoundError,
             "no weights file",
         ),
-        (drop_head, ValueError, "does not fit its configuration.*gripper_head.bias"),
+        (drop_head, ValueError, "does not fit its configuration.*heads.gripper.bias"),
         (
             lambda checkpoint: edit_config(checkpoint, chunk_size=4),
             ValueError,

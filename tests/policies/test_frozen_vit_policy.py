@@ -45,14 +45,14 @@ def test_only_the_heads_train(make_policy, make_batch, images):
     before = policy(make_batch(policy, 2) | {"observation.images.base": images})[0]
     assert before.requires_grad
     assert {name for name, p in policy.named_parameters() if p.requires_grad} == {
-        f"{head}.{kind}" for head in ("translation_head", "gripper_head") for kind in ("weight", "bias")
+        f"heads.{head}.{kind}" for head in ("translation", "gripper") for kind in ("weight", "bias")
     }
     assert sum(p.numel() for p in policy.get_optim_params()) == 193 * 8 * 4
 
 
 def test_heads_do_not_depend_on_the_backbones_initialisation(make_policy, weights):
     one, other = make_policy(), make_policy(backbone_path=str(weights("vit_tiny16", seed=1)))
-    torch.testing.assert_close(one.gripper_head.weight, other.gripper_head.weight)
+    torch.testing.assert_close(one.heads.gripper.weight, other.heads.gripper.weight)
 
 
 @pytest.mark.parametrize("gripper_head", ["bce", "regression"])

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F  # noqa: N812
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
@@ -17,6 +16,7 @@ from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
 from .ensembling import ensemble
 from .features import check_features, describe
+from .heads import ChunkErrors, ChunkHeads, chunk_errors
 from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
@@ -61,9 +61,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             check_features(config.feature_column, expected, spec.feature_dim)
 
         state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
-        self.n_regressed = len(config.action_names) - 1
-        self.translation_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size * self.n_regressed)
-        self.gripper_head = nn.Linear(spec.feature_dim + state_dim, config.chunk_size)
+        n_regressed = len(config.action_names) - 1
+        self.heads = ChunkHeads(spec.feature_dim + state_dim, config.chunk_size, n_regressed, config.action_scale)
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
         self.register_buffer("feature_std", torch.ones(spec.feature_dim))
@@ -95,25 +94,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             and the next call in training mode reports its mean over all valid steps as
             `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data.
         """
-        raw, target = self._raw_chunk(batch), batch[ACTION]
-        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(target[..., 0], dtype=torch.bool))
-        squared = (raw[..., :-1] - target[..., :-1]).pow(2).masked_fill(padded[..., None], 0.0)
-        gripper = self._gripper_loss(raw[..., -1], target[..., -1]).masked_fill(padded, 0.0)
-        n_valid = (~padded).sum(dim=1)
-        translation_loss = squared.mean(dim=-1).sum(dim=1)
-        gripper_loss = gripper.sum(dim=1)
-        logs = {
-            "regression_loss": (translation_loss.sum() / n_valid.sum()).item(),
-            "gripper_loss": (gripper_loss.sum() / n_valid.sum()).item(),
-        }
+        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
+        errors = chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, self.config.gripper_head)
+        logs = {"regression_loss": errors.regression_loss().item(), "gripper_loss": errors.gripper_loss().item()}
         if self.training:
             logs |= self._heldout_report
             self._heldout_report = {}
         else:
-            self._track_heldout(squared, int(n_valid.sum()))
-        if reduction == "none":
-            return (translation_loss + gripper_loss) / n_valid.clamp(min=1), logs
-        return (translation_loss + gripper_loss).sum() / n_valid.sum(), logs
+            self._track_heldout(errors)
+        return (errors.loss_per_sample() if reduction == "none" else errors.loss()), logs
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
         """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
@@ -216,13 +205,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
             )
 
-    def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return (B, T, A): bounded translations, then the gripper's logit (or regressed number)."""
+    def head_inputs(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return what the heads see, (B, D): the feature, standardised if the configuration says so, and the state."""
         inputs = (self._features(batch) - self.feature_mean) / self.feature_std
-        if self.config.use_state:
-            inputs = torch.cat([inputs, batch[OBS_STATE]], dim=-1)
-        regressed = self.translation_head(inputs).unflatten(-1, (self.config.chunk_size, self.n_regressed))
-        return torch.cat([self.config.action_scale * regressed.tanh(), self.gripper_head(inputs)[..., None]], dim=-1)
+        return torch.cat([inputs, batch[OBS_STATE]], dim=-1) if self.config.use_state else inputs
+
+    def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        return self.heads(self.head_inputs(batch))
 
     def _features(self, batch: dict[str, Tensor]) -> Tensor:
         if self.config.feature_key in batch:
@@ -234,20 +223,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             f"{', '.join(batch)}."
         )
 
-    def _gripper_loss(self, raw: Tensor, target: Tensor) -> Tensor:
-        if self.config.gripper_head == "regression":
-            return (raw - target).pow(2)
-        return F.binary_cross_entropy_with_logits(raw, (target + 1) / 2, reduction="none")
-
     def _to_action(self, raw: Tensor) -> Tensor:
         boundary = 0.0 if self.config.gripper_head == "regression" else self.config.gripper_threshold
         gripper = torch.where(raw[..., -1:] > boundary, 1.0, -1.0)
         return torch.cat([raw[..., :-1], gripper], dim=-1)
 
-    def _track_heldout(self, squared: Tensor, n_valid: int) -> None:
+    def _track_heldout(self, errors: ChunkErrors) -> None:
         metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        self._heldout[0] += squared[..., metres].sum().item()
-        self._heldout[1] += n_valid * len(metres)
+        self._heldout[0] += errors.squared[..., metres].sum().item()
+        self._heldout[1] += int(errors.n_valid.sum()) * len(metres)
 
 
 def _encoders_sha256(column: Mapping[str, Any] | None) -> str | None:
