@@ -30,6 +30,10 @@ ARROWS = {
     "study.rows": ("staging",),
     "study.stats": (),
     "study.report": ("contract", "staging"),
+    "study.train": ("policies",),
+    "study.agents": ("policies",),
+    "study.simulators": ("envs",),
+    "study.rollout": ("contract",),
     "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features", "study"),
 }
 # Arrows of functions: the simulator is born on first use.

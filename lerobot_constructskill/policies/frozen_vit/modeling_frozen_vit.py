@@ -94,14 +94,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             and the next call in training mode reports its mean over all valid steps as
             `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data.
         """
-        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
-        errors = chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, self.config.gripper_head)
+        errors = self._chunk_errors(batch)
         logs = {"regression_loss": errors.regression_loss().item(), "gripper_loss": errors.gripper_loss().item()}
         if self.training:
             logs |= self._heldout_report
             self._heldout_report = {}
         else:
-            self._track_heldout(errors)
+            self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
         return (errors.loss_per_sample() if reduction == "none" else errors.loss()), logs
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
@@ -210,6 +209,16 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         inputs = (self._features(batch) - self.feature_mean) / self.feature_std
         return torch.cat([inputs, batch[OBS_STATE]], dim=-1) if self.config.use_state else inputs
 
+    @torch.no_grad()
+    def translation_mse(self, batch: dict[str, Tensor]) -> float:
+        """Return the mean squared translation error over all valid steps of a batch, in m2."""
+        total, count = self._translation_error(self._chunk_errors(batch))
+        return total / count
+
+    def _chunk_errors(self, batch: dict[str, Tensor]) -> ChunkErrors:
+        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
+        return chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, self.config.gripper_head)
+
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         return self.heads(self.head_inputs(batch))
 
@@ -228,10 +237,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         gripper = torch.where(raw[..., -1:] > boundary, 1.0, -1.0)
         return torch.cat([raw[..., :-1], gripper], dim=-1)
 
-    def _track_heldout(self, errors: ChunkErrors) -> None:
+    def _translation_error(self, errors: ChunkErrors) -> tuple[float, int]:
+        """The sum of squares over all valid steps, in m2, and how many numbers it is of."""
         metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        self._heldout[0] += errors.squared[..., metres].sum().item()
-        self._heldout[1] += int(errors.n_valid.sum()) * len(metres)
+        return errors.squared[..., metres].sum().item(), int(errors.n_valid.sum()) * len(metres)
 
 
 def _encoders_sha256(column: Mapping[str, Any] | None) -> str | None:

@@ -1,0 +1,75 @@
+"""The part that trains: two linear heads from one input vector to a chunk of actions, and their loss."""
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+
+class ChunkHeads(nn.Module):
+    """Two linear layers that share no weights (paper, section II).
+
+    Args:
+        input_dim: length of the input vector.
+        chunk_size: steps T predicted at once.
+        n_regressed: translations (and rotations) R of an action; the gripper makes A = R + 1.
+        action_scale: bound of the regression, in metres (and radians).
+    """
+
+    def __init__(self, input_dim: int, chunk_size: int, n_regressed: int, action_scale: float):
+        super().__init__()
+        self.chunk_shape = (chunk_size, n_regressed)
+        self.action_scale = action_scale
+        self.translation = nn.Linear(input_dim, chunk_size * n_regressed)
+        self.gripper = nn.Linear(input_dim, chunk_size)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return (B, T, A) for inputs (B, input_dim): bounded translations, then the gripper's logit or number."""
+        regressed = self.translation(inputs).unflatten(-1, self.chunk_shape)
+        return torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
+
+
+class ChunkErrors(NamedTuple):
+    """What a batch of chunks is off by; zero where a step is padded.
+
+    Args:
+        squared: (B, T, R), in m2 (and rad2).
+        gripper: (B, T), binary cross-entropy or squared error.
+        n_valid: (B,) steps that are not padded.
+    """
+
+    squared: Tensor
+    gripper: Tensor
+    n_valid: Tensor
+
+    def regression_loss(self) -> Tensor:
+        return self.squared.mean(dim=-1).sum() / self.n_valid.sum()
+
+    def gripper_loss(self) -> Tensor:
+        return self.gripper.sum() / self.n_valid.sum()
+
+    def loss(self) -> Tensor:
+        """The mean over all valid steps; the two terms need no weights, because the heads share none."""
+        return self.regression_loss() + self.gripper_loss()
+
+    def loss_per_sample(self) -> Tensor:
+        """The mean over each sample's valid steps, (B,)."""
+        return (self.squared.mean(dim=-1) + self.gripper).sum(dim=1) / self.n_valid.clamp(min=1)
+
+
+def chunk_errors(raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str) -> ChunkErrors:
+    """Compare what the heads returned with actions.
+
+    Args:
+        raw: (B, T, A), from `ChunkHeads`.
+        target: (B, T, A), the gripper +1 or -1.
+        padded: (B, T), true for steps beyond an episode's end.
+        gripper_head: "bce" or "regression".
+    """
+    squared = (raw[..., :-1] - target[..., :-1]).pow(2).masked_fill(padded[..., None], 0.0)
+    if gripper_head == "regression":
+        gripper = (raw[..., -1] - target[..., -1]).pow(2)
+    else:
+        gripper = F.binary_cross_entropy_with_logits(raw[..., -1], (target[..., -1] + 1) / 2, reduction="none")
+    return ChunkErrors(squared, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))

@@ -1,0 +1,126 @@
+"""Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.study.agents import Agent, Observation, encode_together, share_encoders
+from lerobot_constructskill.study.rows import STAGES
+from lerobot_constructskill.study.simulators import Simulators, Step, simulators
+
+OnStep = Callable[[int, int, np.ndarray, Step], None]
+"""Called with the agent's number, the episode's, the action and what the environment returned for it."""
+
+
+@dataclass
+class Episode:
+    """How an evaluation episode went; the fields are those of `rows.Row`."""
+
+    evaluation_seed: int
+    lifted: bool = False
+    placed: bool = False
+    stage: str = STAGES[0]
+    lift_step: int | None = None
+    place_step: int | None = None
+    final_error_m: float | None = None
+    steps: int = 0
+
+    def add(self, step: Step) -> None:
+        """Count one step of the episode."""
+        self.steps += 1
+        if step.info["is_lifted"] and not self.lifted:
+            self.lifted, self.lift_step = True, self.steps
+        if step.info["is_placed"] and not self.placed:
+            self.placed, self.place_step = True, self.steps
+        reached = ("lifted", self.lifted), ("in_bin", step.info["is_in_bin"]), ("placed", self.placed)
+        self.stage = max([self.stage, *(stage for stage, is_reached in reached if is_reached)], key=STAGES.index)
+        self.final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
+
+
+@dataclass
+class Outcome:
+    """What became of one agent: its finished episodes, and why it stopped if it failed."""
+
+    episodes: list[Episode] = field(default_factory=list)
+    error: Exception | None = None
+
+
+def roll_out(
+    agents: Sequence[Agent],
+    env_kwargs: Mapping[str, Any],
+    seeds: Sequence[int],
+    n_workers: int | None = None,
+    on_step: OnStep | None = None,
+) -> list[Outcome]:
+    """Run every agent through one episode per seed, in `ConstructSkillEnv(**env_kwargs)`.
+
+    An agent's episodes are those of `lerobot-eval` with the same seeds and one environment, step for step. An agent
+    that raises has failed; the others go on.
+
+    Args:
+        n_workers: simulator processes; one per core by default.
+
+    Raises:
+        RuntimeError: a simulator's process died.
+    """
+    share_encoders(agents)
+    with simulators(len(agents), env_kwargs, n_workers) as sims, tqdm(unit="step", desc="rollout") as progress:
+        lanes = _Lanes(agents, get_task(env_kwargs.get("task", "brick_to_bin")).instruction, sims, seeds, on_step)
+        while lanes.current:
+            progress.update(len(lanes.current))
+            progress.set_postfix(running=len(lanes.current))
+            lanes.advance()
+    return lanes.outcomes
+
+
+class _Lanes:
+    """The agents that still run, and what each of them sees."""
+
+    def __init__(self, agents, instruction: str, sims: Simulators, seeds: Sequence[int], on_step: OnStep | None):
+        self.agents, self.sims, self.seeds, self.on_step = agents, sims, seeds, on_step
+        self.instruction = instruction
+        self.outcomes = [Outcome() for _ in agents]
+        self.current: dict[int, Step] = {}
+        self._start(range(len(agents)))
+
+    def advance(self) -> None:
+        """One step of every agent that still runs."""
+        seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in self.current.items()}
+        seen = encode_together(self.agents, seen)
+        actions = self._settle({i: _attempt(self.agents[i].act, observation) for i, observation in seen.items()})
+        self.current = self._settle(self.sims.step(actions))
+        for i, step in self.current.items():
+            self.outcomes[i].episodes[-1].add(step)
+            if self.on_step:
+                self.on_step(i, len(self.outcomes[i].episodes) - 1, actions[i], step)
+        finished = [i for i, step in self.current.items() if step.done]
+        for i in finished:
+            del self.current[i]
+        self._start([i for i in finished if len(self.outcomes[i].episodes) < len(self.seeds)])
+
+    def _start(self, numbers: Sequence[int]) -> None:
+        """Begin the next episode of these agents."""
+        seeds = {i: self.seeds[len(self.outcomes[i].episodes)] for i in numbers}
+        for i, seed in seeds.items():
+            self.outcomes[i].episodes.append(Episode(seed))
+            self.agents[i].reset(seed)
+        self.current |= self._settle(self.sims.reset(seeds))
+
+    def _settle(self, results: dict[int, Any]) -> dict[int, Any]:
+        """Take out the agents whose result is an exception: they have failed."""
+        for i, result in results.items():
+            if isinstance(result, Exception):
+                self.outcomes[i].error = result
+                self.outcomes[i].episodes.pop()
+        return {i: result for i, result in results.items() if not isinstance(result, Exception)}
+
+
+def _attempt(act: Callable[[Observation], np.ndarray], observation: Observation) -> np.ndarray | Exception:
+    try:
+        return act(observation)
+    except Exception as error:
+        return error

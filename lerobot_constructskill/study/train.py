@@ -1,0 +1,157 @@
+"""Many training seeds in one pass over a feature set, each of which ends as an ordinary LeRobot checkpoint.
+
+The heads of every seed are stacked and stepped together. AdamW works element by element, gradients are clipped per
+seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding.
+"""
+
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+from tqdm import tqdm
+
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads, chunk_errors
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.study.plan import Training
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One seed after training: its policy, and its translation error on held-out demonstrations in m2, if any were."""
+
+    seed: int
+    policy: FrozenViTChunkPolicy
+    heldout_mse_m2: float | None
+
+
+def train_seeds(
+    config: FrozenViTChunkConfig, dataset: LeRobotDataset, seeds: Sequence[int], training: Training
+) -> list[Trained]:
+    """Train one policy per seed on a feature set.
+
+    A seed decides the first weights of its heads, as in `lerobot-train --seed`, and the order of its samples. The
+    policies share one backbone.
+
+    Raises:
+        ValueError: the data set has images in place of features, or they are another encoder's.
+    """
+    template = make_policy(deepcopy(config), ds_meta=dataset.meta)
+    if template.config.feature_column is None:
+        raise ValueError(
+            f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
+            "constructskill-encode makes of a data set."
+        )
+    table = _read_table(template, dataset)
+    is_heldout = _episodes(dataset) % training.holdout == training.holdout - 1
+    inputs = template.head_inputs(table)
+    heads = [_fresh_heads(template, inputs.shape[1], seed) for seed in seeds]
+    rows = torch.nonzero(~is_heldout).squeeze(1)
+    _step_together(heads, template.config, inputs, table, [_Order(rows, seed) for seed in seeds], training)
+    policies = [_with_heads(template, its_heads) for its_heads in heads]
+    heldout = {name: column[is_heldout] for name, column in table.items()} if is_heldout.any() else None
+    errors = [policy.translation_mse(heldout) if heldout else None for policy in policies]
+    return [Trained(*one) for one in zip(seeds, policies, errors, strict=True)]
+
+
+def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folder: Path) -> None:
+    """Write what `lerobot-eval --policy.path=<folder>` loads: configuration, weights and the two processors."""
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats):
+        processor.save_pretrained(folder)
+
+
+class _Order:
+    """The order in which one seed sees its samples: every row once per epoch."""
+
+    def __init__(self, rows: Tensor, seed: int):
+        self.rows = rows
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def epoch(self) -> Tensor:
+        return self.rows[torch.randperm(len(self.rows), generator=self.generator)]
+
+
+def _episodes(dataset: LeRobotDataset) -> Tensor:
+    return torch.as_tensor(dataset.hf_dataset.with_format("numpy")["episode_index"][:]).flatten()
+
+
+def _read_table(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> dict[str, Tensor]:
+    """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T)."""
+    columns = dataset.hf_dataset.with_format("numpy")
+    names = [policy.config.feature_key, *(n for n in policy.config.input_features if n in columns.column_names)]
+    table = {name: torch.as_tensor(columns[name][:]) for name in names}
+    rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
+    table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
+    table[f"{ACTION}_is_pad"] = rows > last
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    return {name: value for name, value in preprocess(table).items() if torch.is_tensor(value)}
+
+
+def _chunk_rows(episodes: Tensor, chunk_size: int) -> tuple[Tensor, Tensor]:
+    """Rows (N, T) of the steps from every row on, and the last row (N, 1) of its episode."""
+    rows = torch.arange(len(episodes))
+    last = torch.searchsorted(episodes, episodes, right=True) - 1
+    return rows[:, None] + torch.arange(chunk_size), last[:, None]
+
+
+def _fresh_heads(policy: FrozenViTChunkPolicy, input_dim: int, seed: int) -> ChunkHeads:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        heads = ChunkHeads(input_dim, *policy.heads.chunk_shape, policy.heads.action_scale)
+    return heads.to(policy.config.device)
+
+
+def _step_together(
+    heads: Sequence[ChunkHeads],
+    config: FrozenViTChunkConfig,
+    inputs: Tensor,
+    table: dict[str, Tensor],
+    orders: Sequence[_Order],
+    training: Training,
+) -> None:
+    """Train `heads` in place."""
+    preset = config.get_optimizer_preset()
+    stacked, _ = stack_module_state(list(heads))
+    parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
+    optimizer = preset.build(list(parameters.values()))
+    n_steps = training.epochs * -(-len(orders[0].rows) // training.batch_size)
+    for batch in tqdm(_batches(orders, training), f"training {len(heads)} seeds", n_steps, unit="step"):
+        target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
+        raw = vmap(lambda own, seen: functional_call(heads[0], own, (seen,)))(parameters, inputs[batch])
+        losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss())(raw, target, padded)
+        optimizer.zero_grad()
+        losses.sum().backward()
+        _clip_each(parameters.values(), preset.grad_clip_norm)
+        optimizer.step()
+    for number, own in enumerate(heads):
+        own.load_state_dict({name: tensor[number] for name, tensor in parameters.items()})
+
+
+def _batches(orders: Sequence[_Order], training: Training) -> Iterator[Tensor]:
+    """Yield rows (S, B), one line per seed."""
+    for _ in range(training.epochs):
+        yield from torch.stack([order.epoch() for order in orders]).split(training.batch_size, dim=1)
+
+
+def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
+    """`torch.nn.utils.clip_grad_norm_` for every seed by itself."""
+    gradients = [parameter.grad for parameter in parameters]
+    norms = torch.stack([gradient.flatten(1).norm(dim=1) for gradient in gradients]).norm(dim=0)
+    scale = (longest / (norms + 1e-6)).clamp(max=1.0)
+    for gradient in gradients:
+        gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
+
+
+def _with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
+    """A copy of a policy with other heads and the same backbone."""
+    policy = deepcopy(template, {id(template.backbone): template.backbone})
+    policy.heads = heads
+    return policy

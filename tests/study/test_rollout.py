@@ -1,0 +1,109 @@
+"""Rollouts in lockstep are `lerobot-eval`'s, step for step, and a policy that fails takes none down with it."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.scripts.lerobot_eval import rollout
+
+from lerobot_constructskill.contract import GRIPPER_CLOSED
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.study.agents import PolicyAgent
+from lerobot_constructskill.study.rollout import Episode, roll_out
+from lerobot_constructskill.study.simulators import Step
+
+pytestmark = [pytest.mark.sim]
+
+STEPS, SEEDS = 7, [1000, 1001]
+ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial state depends on the seed
+
+
+def random_agent(config, seed, **fields):
+    torch.manual_seed(seed)
+    filled = config(**fields)
+    filled.input_features = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+    policy = FrozenViTChunkPolicy(filled)
+    return PolicyAgent(policy, *make_pre_post_processors(policy.config))
+
+
+@pytest.fixture(scope="module")
+def vector():
+    (vector,) = ConstructSkillEnvConfig(**ENV).create_envs(n_envs=1)["constructskill"].values()
+    yield vector
+    vector.close()
+
+
+def lerobots_actions(agent, vector, seed):
+    """What `lerobot-eval` does with one environment, as (steps, A)."""
+    same = [lambda batch: batch] * 2
+    agent.policy.reset()
+    ran = rollout(vector, agent.policy, *same, agent.preprocessor, agent.postprocessor, seeds=[seed])
+    return ran["action"][0].numpy()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"backbone_precision": "bfloat16"},
+        {"backbone_precision": "float32"},
+        {"temporal_ensemble_coeff": None, "n_action_steps": 4},
+    ],
+    ids=str,
+)
+def test_lockstep_equals_lerobot_eval_step_for_step(fields, config, vector):
+    if fields.get("backbone_precision") == "bfloat16":
+        pytest.importorskip("openvino", reason="autocast's features depend on the batch")
+    agents = [random_agent(config, seed, **fields) for seed in range(2)]
+    seen = {}
+    outcomes = roll_out(
+        agents, ENV, SEEDS, on_step=lambda i, episode, a, _: seen.setdefault((i, episode), []).append(a)
+    )
+    assert all(len(outcome.episodes) == 2 and outcome.error is None for outcome in outcomes)
+    assert len({id(agent.encoder) for agent in agents}) == 1
+    for (i, episode), actions in seen.items():
+        np.testing.assert_array_equal(actions, lerobots_actions(agents[i], vector, SEEDS[episode]))
+    assert not np.array_equal(seen[0, 0], seen[1, 0]) and not np.array_equal(seen[0, 0], seen[0, 1])
+
+
+class Broken:
+    """Fails at its third step, or acts in a way that the environment refuses."""
+
+    encoder = None
+
+    def __init__(self, action):
+        self.action = action
+        self.n = 0
+
+    def reset(self, seed):
+        self.n = 0
+
+    def act(self, observation):
+        self.n += 1
+        if self.action is None and self.n == 3:
+            raise ValueError("lost the plot")
+        return np.zeros(4, dtype=np.float32) if self.action is None else self.action
+
+
+def test_a_failing_agent_is_recorded_and_the_others_go_on():
+    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    agents = [Broken(None), hover, Broken(np.full(4, np.nan, dtype=np.float32))]
+    failed, fine, refused = roll_out(agents, ENV, SEEDS, n_workers=2)
+    assert "lost the plot" in str(failed.error) and failed.episodes == []
+    assert "finite" in str(refused.error) and refused.episodes == []
+    assert fine.error is None
+    assert [(e.evaluation_seed, e.steps, e.stage) for e in fine.episodes] == [(s, STEPS, "none") for s in SEEDS]
+
+
+def step(**info):
+    state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
+    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_placed": False} | info)
+
+
+def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
+    episode = Episode(1000)
+    for info in ({}, {"is_lifted": True}, {"is_lifted": True, "is_in_bin": True}, {"is_lifted": True}):
+        episode.add(step(**info))
+    assert (episode.stage, episode.lift_step, episode.place_step, episode.steps) == ("in_bin", 2, None, 4)
+    assert episode.final_error_m == 5.0 and episode.lifted and not episode.placed

@@ -1,0 +1,100 @@
+"""Seeds trained together are the seeds trained alone, and end as LeRobot checkpoints."""
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+
+from lerobot_constructskill.study.agents import PolicyAgent
+from lerobot_constructskill.study.plan import Training
+from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+
+TRAINING = Training(epochs=3, batch_size=16, holdout=4)
+FIELDS = [{}, {"chunk_size": 1}, {"gripper_head": "regression"}, {"use_state": True}, {"standardize_features": True}]
+
+
+def chunked(dataset, policy):
+    return LeRobotDataset(
+        dataset.repo_id,
+        root=dataset.root,
+        delta_timestamps={"action": [i / dataset.fps for i in policy.config.action_delta_indices]},
+    )
+
+
+def train_alone(config, dataset, seed, training):
+    """One seed as a plain loop over LeRobot's own loader items, `policy.forward`, AdamW and gradient clipping."""
+    torch.manual_seed(seed)
+    policy = make_policy(config, ds_meta=dataset.meta).train()
+    items = chunked(dataset, policy)
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    preset = policy.config.get_optimizer_preset()
+    optimizer = preset.build(policy.get_optim_params())
+    rows = [i for i in range(len(items)) if int(items[i]["episode_index"]) % training.holdout != training.holdout - 1]
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(training.epochs):
+        order = torch.tensor(rows)[torch.randperm(len(rows), generator=generator)]
+        for batch in order.split(training.batch_size):
+            loss, _ = policy(preprocess(torch.utils.data.default_collate([items[int(i)] for i in batch])))
+            optimizer.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), preset.grad_clip_norm)
+            optimizer.step()
+    return policy
+
+
+@pytest.mark.parametrize("fields", FIELDS, ids=str)
+def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
+    together = train_seeds(config(**fields), feature_set, [3, 0, 7], TRAINING)
+    alone = train_alone(config(**fields), feature_set, 0, TRAINING)
+    for name, parameter in alone.heads.state_dict().items():
+        torch.testing.assert_close(together[1].policy.heads.state_dict()[name], parameter, atol=1e-6, rtol=1e-4)
+    weights = [trained.policy.heads.translation.weight for trained in together]
+    assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
+
+
+def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monkeypatch):
+    """With a bound that every step exceeds, the parity above holds only if no seed's norm reaches another's."""
+    from lerobot.optim import AdamWConfig
+
+    bounded = config()
+    monkeypatch.setattr(type(bounded), "get_optimizer_preset", lambda self: AdamWConfig(1e-3, grad_clip_norm=1e-3))
+    together = train_seeds(bounded, feature_set, [0, 1], TRAINING)
+    alone = train_alone(bounded, feature_set, 1, TRAINING)
+    weight = together[1].policy.heads.translation.weight
+    torch.testing.assert_close(weight, alone.heads.translation.weight, atol=1e-6, rtol=1e-4)
+
+
+def test_the_held_out_error_is_that_of_every_fourth_episode(config, feature_set):
+    (trained,) = train_seeds(config(), feature_set, [0], TRAINING)
+    items = [item for item in chunked(feature_set, trained.policy) if int(item["episode_index"]) in (3, 7)]
+    batch = torch.utils.data.default_collate(items)
+    error = (trained.policy.predict_action_chunk(batch) - batch["action"])[~batch["action_is_pad"]][:, :3]
+    assert trained.heldout_mse_m2 == pytest.approx(error.pow(2).mean().item(), rel=1e-5)
+
+
+def test_without_a_held_out_episode_there_is_no_error(config, feature_set):
+    (trained,) = train_seeds(config(), feature_set, [0], Training(epochs=1, batch_size=16, holdout=100))
+    assert trained.heldout_mse_m2 is None
+
+
+def test_a_checkpoint_is_lerobots_own_and_acts_alike(config, feature_set, tmp_path):
+    trained = train_seeds(config(use_state=True), feature_set, [0, 1], TRAINING)
+    for one in trained:
+        save_checkpoint(one.policy, feature_set, tmp_path / str(one.seed))
+    for one in trained:
+        loaded = PolicyAgent.from_pretrained(tmp_path / str(one.seed), "cpu").policy
+        assert loaded.config.input_features == one.policy.config.input_features
+        for name, tensor in one.policy.state_dict().items():
+            assert torch.equal(loaded.state_dict()[name], tensor)
+
+
+def test_images_are_refused(config, feature_set, monkeypatch):
+    features = {k: v for k, v in feature_set.meta.features.items() if "features" not in k}
+    features["observation.images.base"] = {
+        "dtype": "video",
+        "shape": (224, 224, 3),
+        "names": ["height", "width", "channels"],
+    }
+    monkeypatch.setattr(type(feature_set.meta), "features", features)
+    with pytest.raises(ValueError, match="has no observation.features.base"):
+        train_seeds(config(), feature_set, [0], TRAINING)
