@@ -12,6 +12,9 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+
+VECTORIZATIONS = ("process", "native")
 
 
 @EnvConfig.register_subclass("constructskill")
@@ -27,6 +30,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
             Training and evaluation should see the same robot.
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
+        vectorization: "process" (a simulator for each environment) or "native" (one for all, which needs a GPU for
+            more than one environment).
     """
 
     task: str = "brick_to_bin"
@@ -35,12 +40,16 @@ class ConstructSkillEnvConfig(EnvConfig):
     episode_length: int | None = None
     light_robot: bool | None = None
     render_backend: str = "auto"
+    vectorization: str = "process"
 
     def __post_init__(self):
         if self.max_parallel_tasks != 1:
             raise ValueError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
         if self.fps != FPS:
             raise ValueError(f"fps must be {FPS}, the control rate of every task, not {self.fps}.")
+        if self.vectorization not in VECTORIZATIONS:
+            choices = " or ".join(VECTORIZATIONS)
+            raise ValueError(f"vectorization must be {choices}, not '{self.vectorization}'.")
         row = get_task(self.task)
         self._make_env()  # refuses what no environment can be made with
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(row.action_names),))}
@@ -63,6 +72,8 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """`{"constructskill": {0: vector environment}}`; every sub-environment freezes after its episode's end."""
+        if self.vectorization == "native":
+            return {self.type: {0: NativeVectorEnv(n_envs, **self.gym_kwargs)}}
         env_fns = [partial(ConstructSkillEnv, **self.gym_kwargs) for _ in range(n_envs)]
         if use_async_envs and n_envs > 1:
             # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.

@@ -119,7 +119,7 @@ class ConstructSkillEnv(gym.Env):
         """
         if self._env is None:
             raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
-        obs, reward, terminated, _, info = self._env.step(self._maniskill_action(action))
+        obs, reward, terminated, _, info = self._env.step(self.maniskill_action(action))
         self._steps += 1
         truncated = self._steps >= self._max_episode_steps
         return self._observation(obs), float(reward[0]), bool(terminated[0]), truncated, self._info(info)
@@ -151,22 +151,28 @@ class ConstructSkillEnv(gym.Env):
 
     # ManiSkill
 
+    def make_scene(self, num_envs: int = 1) -> gym.Env:
+        """The task's ManiSkill environment; several copies of it in one simulator need a GPU."""
+        import lerobot_constructskill.sim.register  # noqa: F401
+
+        return gym.make(
+            self._row.env_id,
+            num_envs=num_envs,
+            obs_mode="rgb",
+            reward_mode="sparse",
+            render_mode="rgb_array",
+            max_episode_steps=None,
+            disable_env_checker=True,
+            **self._scene_kwargs,
+        ).unwrapped
+
     def _ensure_env(self) -> gym.Env:
         if self._env is None:
-            import lerobot_constructskill.sim.register  # noqa: F401
-
-            self._env = gym.make(
-                self._row.env_id,
-                obs_mode="rgb",
-                reward_mode="sparse",
-                render_mode="rgb_array",
-                max_episode_steps=None,
-                disable_env_checker=True,
-                **self._scene_kwargs,
-            ).unwrapped
+            self._env = self.make_scene()
         return self._env
 
-    def _maniskill_action(self, action: np.ndarray) -> np.ndarray:
+    def maniskill_action(self, action: np.ndarray) -> np.ndarray:
+        """ManiSkill's normalised `pd_ee_delta_pose` action, (7,) in [-1, 1], for one of this environment's."""
         action = np.asarray(action, dtype=np.float32)
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():

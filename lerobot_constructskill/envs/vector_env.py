@@ -1,0 +1,130 @@
+"""Many environments in one natively vectorised simulator, as LeRobot wants a vector environment.
+
+With PhysX on a GPU one scene steps and renders hundreds of environments at once; PhysX on a CPU knows only one.
+Not yet run on a GPU: here one environment is tested against `ConstructSkillEnv`, which it has to equal.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+
+class NativeVectorEnv(gym.vector.VectorEnv):
+    """`n_envs` copies of a task in one simulator.
+
+    An environment whose episode has ended is frozen: until the next `reset` it repeats its last observation and info
+    with reward 0, as LeRobot's `freeze_after_episode_end` does. Every episode's initial state comes from its own seed,
+    whatever the other environments do.
+
+    Args:
+        n_envs: how many; more than one needs a GPU.
+        kwargs: those of `ConstructSkillEnv`.
+
+    Raises:
+        OSError: there is no GPU for more than one (on the first `reset`).
+    """
+
+    def __init__(self, n_envs: int, **kwargs: Any):
+        self._single = ConstructSkillEnv(**kwargs)
+        self.num_envs = n_envs
+        self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
+        self.render_mode = ConstructSkillEnv.render_mode
+        self.single_observation_space = self._single.observation_space
+        self.single_action_space = self._single.action_space
+        self.observation_space = batch_space(self.single_observation_space, n_envs)
+        self.action_space = batch_space(self.single_action_space, n_envs)
+        self._env = None
+        self._steps = 0
+        self._done = np.zeros(n_envs, dtype=bool)
+        self._terminal: tuple | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode in every environment; an integer seeds environment i with `seed + i`."""
+        if isinstance(seed, int):
+            seed = range(seed, seed + self.num_envs)
+        seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
+        if self._env is None:
+            self._env = self._make_scene()
+        obs, info = self._env.reset(seed=[int(s) for s in seeds])
+        self._steps = 0
+        self._done[:] = False
+        return self._observations(obs), self._infos(info)
+
+    def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance 1/20 s; `actions` are (n_envs, A) in metres.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+        """
+        if self._env is None:
+            raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
+        scaled = np.stack([self._single.maniskill_action(action) for action in actions])
+        obs, reward, terminated, _, info = self._env.step(scaled)
+        self._steps += 1
+        truncated = np.full(self.num_envs, self._steps >= self._single._max_episode_steps)
+        outcome = reward.cpu().numpy(), terminated.cpu().numpy(), truncated
+        transition = self._observations(obs), *outcome, self._infos(info)
+        if self._done.any():
+            transition = _keep(self._terminal, transition, self._done)
+        obs, reward, terminated, truncated, info = transition
+        self._terminal = obs, np.zeros_like(reward), terminated, truncated, info
+        self._done = terminated | truncated
+        return transition
+
+    def render(self) -> tuple[np.ndarray, ...]:
+        """A close-up of every environment, each (H, W, 3) uint8."""
+        return tuple(self._env.render().cpu().numpy())
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """The attribute or method `name` of every environment."""
+        if name == "render":
+            return self.render()
+        value = getattr(self._single, name)
+        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        return self.call(name)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _make_scene(self) -> gym.Env:
+        try:
+            return self._single.make_scene(self.num_envs)
+        except RuntimeError as error:
+            if "cuda" not in str(error):
+                raise
+            raise OSError(
+                f"{self.num_envs} environments in one simulator need a GPU, and there is none ({error}); use one, or "
+                "--env.vectorization=process."
+            ) from None
+
+    def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
+        cameras = OBS_TYPES[self._single.obs_type]
+        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in cameras}}
+        if self._single.obs_type == "pixels_agent_pos":
+            seen["agent_pos"] = self._env.agent_state().cpu().numpy().astype(np.float32)
+        return seen
+
+    def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
+        booleans = {name: value.cpu().numpy() for name, value in info.items() if name.startswith("is_")}
+        return {"is_success": info["success"].cpu().numpy(), **booleans}
+
+
+def _keep(old: Any, new: Any, frozen: np.ndarray) -> Any:
+    """`new` with the rows of `old` where `frozen`, through tuples and dicts of arrays."""
+    if isinstance(new, tuple):
+        return tuple(_keep(a, b, frozen) for a, b in zip(old, new, strict=True))
+    if isinstance(new, dict):
+        return {name: _keep(old[name], value, frozen) for name, value in new.items()}
+    return np.where(frozen.reshape(-1, *[1] * (new.ndim - 1)), old, new)
