@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds test check pins
+.PHONY: help setup demo ten-seeds test check bench pins
 
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
 PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile
@@ -23,6 +23,9 @@ check: setup ## lint, and the tests that need neither simulator nor training
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
 	$(PARALLEL) -q -m "not sim and not slow"
+
+bench: setup ## every speed claim, measured side by side on this machine, into benchmarks/RESULTS.md
+	.venv/bin/python benchmarks/run.py
 
 pins: ## resolve pyproject.toml afresh into constraints.txt
 	@./setup.sh pins

@@ -34,7 +34,7 @@ class OpenVINOEncoder:
         example = torch.zeros(1, 3, image_size, image_size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # tracing warns of every shape that it takes for a constant
-            graph = openvino.convert_model(_Traceable(model, encode), example_input=example)
+            graph = openvino.convert_model(Traceable(model, encode), example_input=example)
         graph.reshape(list(example.shape))
         settings = {
             "INFERENCE_PRECISION_HINT": "bf16",
@@ -61,7 +61,9 @@ class OpenVINOEncoder:
             output[i] = request.get_output_tensor(number).data[0]
 
 
-class _Traceable(nn.Module):
+class Traceable(nn.Module):
+    """A backbone and its `encode` as the one module that tracers want."""
+
     def __init__(self, model: nn.Module, encode: Encode):
         super().__init__()
         self.model, self.encode = model, encode

@@ -1,0 +1,52 @@
+"""Environment steps per second while ten policies are evaluated, in lockstep and by lerobot-eval one by one."""
+
+import json
+
+from measure import LOG, OUT, report, run
+
+POLICIES, STOCK_RUNS, STEPS = 10, 2, 250
+
+
+def lockstep() -> tuple[float, int]:
+    """Wall seconds and environment steps of one episode of every policy."""
+    seconds, _ = run("python", "benchmarks/lockstep.py", str(OUT / "checkpoints"), str(STEPS))
+    return seconds, int(LOG.read_text().split("steps:")[-1])
+
+
+def stock(seed: int) -> tuple[float, int]:
+    """The same of lerobot-eval with one policy: float32, the robot's original meshes, one environment."""
+    folder = OUT / "eval" / str(seed)
+    seconds, _ = run(
+        "lerobot-eval",
+        f"--policy.path={OUT}/checkpoints/seed_{seed}",
+        "--policy.backbone_precision=float32",
+        "--env.type=constructskill",
+        "--env.light_robot=false",
+        f"--env.episode_length={STEPS}",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={folder}",
+    )
+    return seconds, frames(folder)
+
+
+def frames(folder) -> int:
+    """Length of the episode that lerobot-eval filmed; it does not say it anywhere else."""
+    import av
+
+    (video,) = json.loads((folder / "eval_info.json").read_text())["overall"]["video_paths"]
+    with av.open(video) as container:
+        return sum(1 for _ in container.decode(video=0)) - 1
+
+
+def main() -> None:
+    runs = [stock(seed) for seed in range(STOCK_RUNS)]
+    seconds, steps = lockstep()
+    rate = sum(steps for _, steps in runs) / sum(seconds for seconds, _ in runs)
+    note = f"start-up counted on both sides; {STOCK_RUNS} of the ten stock runs were timed"
+    what = "environment steps/s, ten policies evaluated"
+    report(what, steps / seconds, "ten runs of lerobot-eval, one after another", rate, 4, note)
+
+
+if __name__ == "__main__":
+    main()

