@@ -17,6 +17,9 @@ IMAGE_SIZE = 224
 ACTION_SCALE = 0.1
 """Metres (and radians) that ManiSkill's normalised `pd_ee_delta_pose` calls 1.0."""
 
+ROBOT_BASE = (-0.615, 0.0, 0.0)
+"""Where the Panda stands in the world, in metres: ManiSkill's own default."""
+
 GRIPPER_OPEN, GRIPPER_CLOSED = 1.0, -1.0
 
 TRANSLATION = ("dx", "dy", "dz")
@@ -116,6 +119,14 @@ TASKS = {
             instruction="Pick up the brick and place it in the bin.",
             horizon=700,
             scene="lerobot_constructskill.sim.tasks.brick:BrickToBinEnv",
+            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+        ),
+        Task(
+            name="brick_to_bin_shifted",
+            env_id="ConstructionPickPlaceShifted-v1",
+            instruction="Pick up the brick and place it in the bin.",
+            horizon=700,
+            scene="lerobot_constructskill.sim.tasks.brick_shifted:BrickToBinShiftedEnv",
             expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
         ),
         Task(

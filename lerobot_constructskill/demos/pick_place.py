@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN
+from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress
 
 GRAVITY = 9.81  # m/s2
@@ -14,6 +14,13 @@ ABOVE_TOP = 0.02
 
 AROUND = 0.005
 """Height of the TCP over the object's top from which down the finger tips, 9 mm below it, are around the object."""
+
+SHOULDER_HEIGHT, WRIST_RADIUS, WRIST_HEIGHT = 0.333, 0.088, 0.2104
+"""Of the Panda with its hand pointing down, in metres: the shoulder above the base, and the wrist above the TCP and
+nearer to the base (Franka's kinematic parameters)."""
+
+REACH = 0.66
+"""Longest distance from shoulder to wrist in metres; 0.06 short of the stretched arm, near which IK fails."""
 
 PHASES = tuple(Phase)
 GRIPPER = {
@@ -69,7 +76,7 @@ class PickPlaceExpert:
             case Phase.DESCEND:
                 return self._grasp_point(state)
             case Phase.LIFT:
-                return progress.anchor + [0, 0, self.config.lift_height]
+                return _within_reach(progress.anchor + [0, 0, self.config.lift_height])
             case Phase.CARRY:
                 return self._release_point(state)
         raise ValueError(f"{progress.phase} has no target.")
@@ -93,3 +100,10 @@ class PickPlaceExpert:
         rim = state.bin_position[2] + state.bin_interior[2] / 2
         below_tcp = state.object_size[2] - self.config.finger_depth
         return np.array([*state.bin_position[:2], rim + self.config.release_clearance + below_tcp])
+
+
+def _within_reach(point: np.ndarray) -> np.ndarray:
+    """`point`, (3,) metres, or the highest one below it that the arm reaches."""
+    radius = np.hypot(*(point[:2] - ROBOT_BASE[:2])) - WRIST_RADIUS
+    highest = SHOULDER_HEIGHT - WRIST_HEIGHT + np.sqrt(max(0.0, REACH**2 - radius**2))
+    return np.array([*point[:2], min(point[2], highest)])

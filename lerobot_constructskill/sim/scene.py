@@ -23,12 +23,10 @@ from lerobot_constructskill.contract import (
     OBS_TYPES,
     REWARD_LIFTED,
     REWARD_PLACED,
+    ROBOT_BASE,
     Camera,
 )
 from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
-
-ROBOT_BASE = (-0.615, 0.0, 0.0)
-"""Robot base in metres: ManiSkill's own default."""
 
 WALL = 0.005
 """Thickness of the bin's walls and floor, in metres (paper, section II)."""

@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_constructskill.contract import DEMO_SEED_START, GRIPPER_OPEN, SIM_STATE, TASKS
 from lerobot_constructskill.demos.demonstrate import demonstrate
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -61,6 +61,14 @@ def test_the_expert_stays_above_an_object_it_is_not_over():
         *_, progress = expert.act(state(tcp_pose=[0, 0, 0.22, 0, 1, 0, 0]), progress)
     assert expert.act(over, progress)[0][2] < 0
     assert expert.act(beside, progress)[0][2] > 0 and expert.act(beside, progress)[0][1] < 0
+
+
+@pytest.mark.parametrize("x, height", [(0.0, 0.40), (0.10, 0.25)])
+def test_the_lift_is_the_papers_or_as_high_as_the_arm_reaches(x, height):
+    expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())
+    held = state(tcp_pose=[x, 0, 0.08, 0, 1, 0, 0])
+    target = expert._target(held, Progress(Phase.LIFT, 0, held.tcp))
+    np.testing.assert_allclose(target - held.tcp, [0, 0, height], atol=0.01)
 
 
 @pytest.mark.parametrize(
