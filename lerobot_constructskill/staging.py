@@ -12,10 +12,14 @@ MARK = ".constructskill"
 
 
 @contextmanager
-def staged(root: Path) -> Iterator[Path]:
+def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
     """Yield a path to write a folder to; it becomes `root` when the block ends, and is removed if the block fails.
 
     The path lies in `<root>.partial`. What a killed process left there is removed first.
+
+    Args:
+        keep: name of a folder beside the path, for finished parts: what lies in it outlives a killed or failed block
+            and is there again for the next one, until `root` is whole.
 
     Raises:
         FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
@@ -32,13 +36,16 @@ def staged(root: Path) -> Iterator[Path]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise FileExistsError(f"Another process is writing {root} at this moment.") from None
+        folder = partial / "dataset"
         try:
-            folder = partial / "dataset"
             shutil.rmtree(folder, ignore_errors=True)
             yield folder
             folder.rename(root)
         finally:
-            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
+            kept = partial / keep if keep else None
+            if root.exists() or kept is None or not kept.exists() or not any(kept.iterdir()):
+                shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextmanager

@@ -48,3 +48,24 @@ def test_two_processes_do_not_share_a_folder(tmp_path):
             pass
         folder.mkdir()
     assert (tmp_path / "set").exists()
+
+
+def test_finished_parts_outlive_a_failure_until_the_folder_is_whole(tmp_path):
+    for attempt in range(2):
+        with pytest.raises(KeyboardInterrupt), staged(tmp_path / "set", keep="parts") as folder:
+            parts = folder.with_name("parts")
+            assert len(list(parts.glob("*"))) == attempt
+            folder.mkdir()
+            parts.mkdir(exist_ok=True)
+            (parts / str(attempt)).touch()
+            raise KeyboardInterrupt
+    with staged(tmp_path / "set", keep="parts") as folder:
+        assert len(list(folder.with_name("parts").iterdir())) == 2 and not folder.exists()
+        folder.mkdir()
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+
+def test_a_failure_without_finished_parts_leaves_nothing(tmp_path):
+    with pytest.raises(KeyboardInterrupt), staged(tmp_path / "set", keep="parts"):
+        raise KeyboardInterrupt
+    assert list(tmp_path.iterdir()) == []

@@ -11,9 +11,12 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 
 def demonstrate(
-    env: ConstructSkillEnv, expert: Expert, noise: NoiseConfig, seed: int
+    env: ConstructSkillEnv, expert: Expert, noise: NoiseConfig, seed: int, labels: str = "clean"
 ) -> tuple[list[dict[str, Any]], bool]:
     """Run one attempt from the initial state of `seed`, whose noise is a function of `seed` too.
+
+    Args:
+        labels: whether `action` is the expert's `clean` command or what was `executed`.
 
     Returns:
         The frames, in the columns of `columns.demonstration_features`, and whether the object was placed. A frame
@@ -37,7 +40,7 @@ def demonstrate(
         frames.append(
             before
             | {
-                "action": clean,
+                "action": clean if labels == "clean" else executed,
                 "dart.executed_action": executed,
                 "dart.noise": executed[:3] - clean[:3],
                 "phase": str(phase),

@@ -1,4 +1,4 @@
-"""Noise on the executed action (Laskey et al. 2017, isotropic baseline); the stored label stays clean."""
+"""Noise on the executed action (Laskey et al. 2017): Gaussian, of a covariance that is fixed or was fitted."""
 
 from dataclasses import dataclass, field
 
@@ -6,25 +6,37 @@ import numpy as np
 
 from lerobot_constructskill.demos.expert import Phase
 
+MODELS = ("none", "fixed", "isotropic", "dart")
+FITTED = ("isotropic", "dart")
+
 
 @dataclass(frozen=True)
 class NoiseConfig:
-    """Zero-mean Gaussian noise on the executed translation (paper, section II).
+    """Zero-mean Gaussian noise on the executed translation.
 
     Args:
-        sigma: standard deviation per axis, in metres; 0 turns noise off.
+        model: `none`; `fixed`: `sigma` on every axis (paper, section II); `dart`: the fitted `covariance`;
+            `isotropic`: as strong as that covariance, but alike on every axis.
+        sigma: standard deviation per axis of `fixed`, in metres; 0 turns noise off.
+        covariance: 3 x 3, in m2: a policy's error on held-out demonstrations, as `constructskill-fit-noise` writes it.
+        fitted_on: what the covariance was fitted on, for the data set's provenance.
         clip: bound on each axis of the executed translation, in metres, with and without noise.
         phases: names of the phases that are perturbed. GRASP and RELEASE stay clean, so that contact is not.
 
     Raises:
-        ValueError: sigma or clip out of range, or a phase that does not exist.
+        ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or is none.
     """
 
+    model: str = "fixed"
     sigma: float = 0.01
+    covariance: list[list[float]] | None = None
+    fitted_on: dict[str, str] | None = None
     clip: float = 0.08
     phases: list[str] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
 
     def __post_init__(self):
+        if self.model not in MODELS:
+            raise ValueError(f"Unknown noise model '{self.model}'; choose one of: {', '.join(MODELS)}.")
         if not 0 <= self.sigma < np.inf:
             raise ValueError(f"Noise sigma must be 0 or more metres, not {self.sigma}.")
         if not self.clip > 0:
@@ -32,6 +44,31 @@ class NoiseConfig:
         unknown = [phase for phase in self.phases if phase not in list(Phase)]
         if unknown:
             raise ValueError(f"Unknown phase {unknown[0]!r}; the phases are: {', '.join(Phase)}.")
+        if self.model in FITTED and self.covariance is None:
+            raise ValueError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
+
+    @property
+    def root(self) -> np.ndarray:
+        """Symmetric square root of the covariance that is drawn from, (3, 3) in metres."""
+        if self.model == "none":
+            return np.zeros((3, 3))
+        if self.model == "fixed":
+            return self.sigma * np.eye(3)
+        covariance = np.array(self.covariance)
+        if self.model == "isotropic":
+            return np.sqrt(np.trace(covariance) / 3) * np.eye(3)
+        values, vectors = np.linalg.eigh(covariance)
+        return vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
+
+
+def _check_covariance(covariance: list[list[float]]) -> None:
+    matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, atol=1e-12):
+        raise ValueError(f"A noise covariance is a symmetric 3 x 3 matrix in m2, not {covariance}.")
+    if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
+        raise ValueError(f"The noise covariance {covariance} has a negative variance.")
 
 
 def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray:
@@ -44,7 +81,7 @@ def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.rando
     Returns:
         (n,) float32; the translation perturbed and clipped, every other channel unchanged.
     """
-    noise = rng.normal(0.0, config.sigma, size=3) * (phase in config.phases)
+    noise = config.root @ rng.standard_normal(3) * (phase in config.phases)
     executed = action.copy()
     executed[:3] = np.clip(action[:3] + noise, -config.clip, config.clip)
     return executed

@@ -1,5 +1,6 @@
 """Data sets of demonstrations: real LeRobotDataset files, written, read back and replayed."""
 
+import hashlib
 import json
 import signal
 import subprocess
@@ -12,8 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, SIM_STATE, TASKS
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase
-from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, make_expert
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
@@ -24,9 +25,9 @@ NEVER = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Two noisy demonstrations with the wrist view, and their frames as a table."""
+    """Three noisy demonstrations with the wrist view, and their frames as a table."""
     root = tmp_path_factory.mktemp("data") / "set"
-    summary = record(GenerateConfig("local/set", str(root), episodes=2, obs_type="pixels_agent_pos"))
+    summary = record(GenerateConfig("local/set", str(root), episodes=3, obs_type="pixels_agent_pos"))
     dataset = LeRobotDataset("local/set", root=root)
     return summary, dataset, dataset.hf_dataset.with_format("numpy")[:]
 
@@ -47,8 +48,18 @@ def test_frames_tasks_and_seeds_are_right(recorded):
     assert frame["task"] == TASKS["brick_to_bin"].instruction
     assert frame["observation.images.base"].shape == (3, 224, 224)
     assert float(frame["observation.images.base"].std()) > 0.05
-    assert sorted(set(table["sim.seed"])) == [DEMO_SEED_START, DEMO_SEED_START + 1]
-    assert (summary.episodes, summary.frames) == (dataset.num_episodes, dataset.num_frames) == (2, len(table["index"]))
+    assert list(dict.fromkeys(table["sim.seed"])) == [DEMO_SEED_START + i for i in range(3)]
+    assert (summary.episodes, summary.frames) == (dataset.num_episodes, dataset.num_frames) == (3, len(table["index"]))
+
+
+def test_the_statistics_are_those_of_all_frames(recorded):
+    _, dataset, table = recorded
+    stats, action = dataset.meta.stats["action"], table["action"]
+    assert list(json.loads((dataset.root / "meta" / "stats.json").read_text())) == sorted(dataset.meta.stats)
+    np.testing.assert_allclose(stats["mean"], action.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(stats["std"], action.std(axis=0), atol=1e-6)
+    for name, quantile in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+        np.testing.assert_allclose(stats[name], np.quantile(action, quantile, axis=0), atol=1e-3)
 
 
 def test_noise_is_where_the_phase_allows_it_and_exactly_zero_elsewhere(recorded):
@@ -63,34 +74,49 @@ def test_noise_is_where_the_phase_allows_it_and_exactly_zero_elsewhere(recorded)
     np.testing.assert_allclose(added[:, :3], table["dart.noise"], atol=1e-7)
 
 
-def test_replaying_the_executed_actions_reproduces_every_outcome(recorded):
+def test_replaying_the_executed_actions_reproduces_every_state_and_outcome(recorded):
     *_, table = recorded
-    env = ConstructSkillEnv("brick_to_bin", "pixels_agent_pos")
     for episode in np.unique(table["episode_index"]):
         rows = np.flatnonzero(table["episode_index"] == episode)
+        env = ConstructSkillEnv("brick_to_bin", "pixels_agent_pos")
         env.reset(seed=int(table["sim.seed"][rows[0]]))
         for row in rows:
-            np.testing.assert_allclose(env.agent_state(), table["observation.state"][row], atol=1e-4)
+            np.testing.assert_array_equal(env.agent_state(), table["observation.state"][row])
             _, reward, success, *_ = env.step(table["dart.executed_action"][row])
             assert (reward, success) == (table["next.reward"][row], table["next.success"][row])
         assert success
+        env.close()
+
+
+def test_labels_are_what_was_executed_where_that_is_asked_for():
+    config = GenerateConfig("local/set", labels="executed")
+    env = ConstructSkillEnv("brick_to_bin", episode_length=30)
+    expert = make_expert(TASKS["brick_to_bin"], config.expert)
+    clean, _ = demonstrate(env, expert, config.noise, 0)
     env.close()
+    executed, _ = demonstrate(env, expert, config.noise, 0, config.labels)
+    env.close()
+    for one, other in zip(clean, executed, strict=True):
+        np.testing.assert_array_equal(other["action"], one["dart.executed_action"])
+        np.testing.assert_array_equal(other["dart.executed_action"], one["dart.executed_action"])
+        assert (one["action"][:3] != one["dart.executed_action"][:3]).all()
 
 
 def test_how_the_set_was_made_travels_with_it(recorded):
     summary, dataset, _ = recorded
     facts = json.loads((dataset.root / SIDECAR).read_text())
+    np.testing.assert_allclose(facts["noise_covariance"], 1e-4 * np.eye(3))
     assert facts["generator"]["noise"]["sigma"] == 0.01 and facts["generator"]["light_robot"] in (True, False)
     assert facts["attempts"] == summary.episodes + len(summary.discarded_seeds)
 
 
-def test_failed_attempts_are_discarded_and_end_a_hopeless_run_with_nothing_left(tmp_path):
+def test_failed_attempts_are_discarded_and_end_a_hopeless_run(tmp_path):
     config = GenerateConfig(
         "local/none", str(tmp_path / "none"), episodes=2, max_steps=60, max_failures=0.5, expert=NEVER
     )
     with pytest.raises(ValueError, match="2 attempts failed"):
         record(config)
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "none").exists()
 
 
 def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
@@ -106,6 +132,8 @@ def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
         (["--task=bricks"], "brick_to_bin"),
         (["--noise.sigma=-1"], "sigma"),
         (["--noise.phases=[GRASPING]"], "PREGRASP"),
+        (["--noise.model=dart"], "constructskill-fit-noise"),
+        (["--workers=0"], "workers"),
         (["--episodes=0"], "episodes"),
         (["--obs_type=rgb"], "pixels_agent_pos"),
         (["--config_path=/dev/null"], "empty"),
@@ -119,19 +147,44 @@ def test_the_command_answers_bad_input_in_one_sentence(flags, words, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
-def test_a_killed_generation_leaves_no_data_set_and_the_next_one_is_whole(tmp_path):
+@pytest.mark.slow
+def test_a_killed_run_of_two_workers_continues_to_the_bytes_of_an_undisturbed_one(recorded, tmp_path):
     root = tmp_path / "set"
-    killed = generate(root, "--episodes=50")
-    data = root.with_name("set.partial") / "dataset" / "data"
-    while not data.exists():
-        assert killed.poll() is None, killed.communicate()
-        time.sleep(0.2)
+    flags = ["--episodes=3", "--obs_type=pixels_agent_pos", "--workers=2"]
+    killed = generate(root, *flags)
+    wait_for(tmp_path, "set.partial/shards/*/*/attempt.json", killed)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     assert not root.exists()
-    summary = record(GenerateConfig("local/set", str(root), episodes=1, noise=NoiseConfig(sigma=0.0)))
-    assert summary.episodes == 1 and [path.name for path in tmp_path.iterdir()] == ["set"]
-    assert len(LeRobotDataset("local/set", root=root)) == summary.frames
+    half = next(tmp_path.glob("set.partial/shards/*")) / "1000002.partial"
+    half.mkdir(exist_ok=True)
+    (half / ".constructskill").touch()
+    (half / "dataset").mkdir(exist_ok=True)
+    resumed = generate(root, *flags)
+    _, stderr = resumed.communicate()
+    assert resumed.returncode == 0, stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    assert hashes(root) == hashes(recorded[1].root)
+
+
+@pytest.mark.slow
+def test_ray_makes_the_same_bytes(recorded, tmp_path):
+    pytest.importorskip("ray", reason="the extra `distributed` brings it")
+    run = generate(tmp_path / "set", "--episodes=3", "--obs_type=pixels_agent_pos", "--workers=2", "--executor=ray")
+    _, stderr = run.communicate()
+    assert run.returncode == 0, stderr
+    assert hashes(tmp_path / "set") == hashes(recorded[1].root)
+
+
+def hashes(root):
+    files = [path for path in root.rglob("*") if path.is_file()]
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def wait_for(folder, pattern, process):
+    while not list(folder.glob(pattern)):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
 
 
 def generate(root, *flags):

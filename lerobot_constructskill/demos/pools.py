@@ -1,0 +1,80 @@
+"""Where attempts run: in this process, in worker processes, or on Ray; the caller sees one `submit`."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
+
+type Submit = Callable[..., Future]
+
+
+@contextmanager
+def open_pool(executor: str, workers: int) -> Iterator[Submit]:
+    """Yield `submit(function, *arguments) -> Future`; leaving waits for what still runs.
+
+    Raises:
+        OSError: a worker process died.
+        ValueError: `ray` was asked for and is not installed.
+    """
+    if executor == "ray":
+        pool = _ray(workers)
+    elif workers == 1:
+        pool = _inline()
+    else:
+        pool = _processes(workers)
+    with pool as submit:
+        yield submit
+
+
+@contextmanager
+def _inline() -> Iterator[Submit]:
+    def submit(function, *arguments) -> Future:
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    yield submit
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[Submit]:
+    try:
+        with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_settle) as pool:
+            yield pool.submit
+    except BrokenExecutor:
+        raise OSError(
+            "A worker process died, for want of memory perhaps; the same command continues with what is finished."
+        ) from None
+
+
+def _settle() -> None:
+    """Make a worker a good child: one thread, deaf to Ctrl-C, which its parent handles, and dead with its parent."""
+    for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+
+
+def _die_with_parent() -> None:
+    parent_process().join()
+    os._exit(1)
+
+
+@contextmanager
+def _ray(workers: int) -> Iterator[Submit]:
+    """Ray on this machine, or on the cluster of `$RAY_ADDRESS`."""
+    try:
+        import ray
+    except ImportError:
+        raise ValueError("Ray is not installed; pip install 'lerobot_env_constructskill[distributed]'.") from None
+    here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}
+    ray.init(log_to_driver=False, logging_level="error", **here)
+    try:
+        yield lambda function, *arguments: ray.remote(function).remote(*arguments).future()
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None
+    finally:
+        ray.shutdown()

@@ -1,0 +1,89 @@
+"""What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from typing import Any
+
+from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
+from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.noise import NoiseConfig
+
+LABELS = ("clean", "executed")
+EXECUTORS = ("processes", "ray")
+
+PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
+"""Packages whose versions may show in the frames."""
+
+
+@dataclass(frozen=True)
+class GenerateConfig:
+    """A data set of scripted demonstrations.
+
+    Args:
+        repo_id: the data set's name, `user/name`.
+        root: folder to write; `$HF_LEROBOT_HOME/<repo_id>` by default. It must not exist.
+        task: a name in `contract.TASKS`.
+        episodes: successful demonstrations to record.
+        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist view). The state is always
+            recorded.
+        max_steps: steps after which an attempt counts as failed.
+        max_failures: failed attempts, as a fraction of `episodes`, at which the run gives up.
+        seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
+        light_robot: as in the environment.
+        labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
+        expert: gains, thresholds and dwells.
+        noise: what is added to the executed action.
+        workers: attempts that run at the same time. The data set does not depend on it.
+        executor: what they run on: `processes` of this machine, or `ray` (extra `distributed`; a cluster needs `root`
+            on a file system that all its machines share).
+
+    Raises:
+        ValueError: unknown task, obs_type, labels or executor, or a count below 1.
+    """
+
+    repo_id: str
+    root: str | None = None
+    task: str = "brick_to_bin"
+    episodes: int = 80
+    obs_type: str = "pixels"
+    max_steps: int = 1000
+    max_failures: float = 1.0
+    seed_start: int = DEMO_SEED_START
+    light_robot: bool | None = None
+    labels: str = "clean"
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    workers: int = 1
+    executor: str = "processes"
+
+    def __post_init__(self):
+        get_task(self.task)
+        for name, choices in (("obs_type", OBS_TYPES), ("labels", LABELS), ("executor", EXECUTORS)):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"Unknown {name} '{getattr(self, name)}'; choose one of: {', '.join(choices)}.")
+        for name in ("episodes", "max_steps", "workers"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}.")
+
+
+def provenance(config: GenerateConfig) -> dict[str, Any]:
+    """What the data set says of its generation; nothing of where and how fast it ran."""
+    facts = asdict(config)
+    for name in ("root", "workers", "executor"):
+        del facts[name]
+    return facts
+
+
+def frames_digest(config: GenerateConfig) -> str:
+    """Hash of everything that a frame depends on, so that shards of two settings never meet in one data set."""
+    facts = provenance(config)
+    for name in ("repo_id", "episodes", "max_failures", "seed_start"):
+        del facts[name]
+    text = json.dumps([facts, package_versions()], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def package_versions() -> dict[str, str]:
+    return {name: version(name) for name in PACKAGES}

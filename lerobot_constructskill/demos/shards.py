@@ -1,0 +1,92 @@
+"""One attempt, one shard: a folder with the attempt's outcome and, if it succeeded, a data set of one episode."""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from lerobot_constructskill.contract import FPS, get_task
+from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import make_expert
+from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.staging import staged
+
+OUTCOME = "attempt.json"
+EPISODE = "episode"
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of one seed.
+
+    Args:
+        seed: of the environment and of the noise.
+        success: whether the object was placed.
+        frames: steps taken.
+        light_robot: how the robot was drawn where the attempt ran.
+    """
+
+    seed: int
+    success: bool
+    frames: int
+    light_robot: bool
+
+
+def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
+    """Run the attempt of `seed` and write its shard `folder/<seed>`, whole or not at all.
+
+    Raises:
+        FileExistsError: the shard exists, or another process is writing it.
+        OSError: this machine cannot render.
+    """
+    task = get_task(config.task)
+    expert = make_expert(task, config.expert)
+    # A simulator of its own, for 0.3 s: PhysX keeps contacts over a reset, which shows in the next episode.
+    env = ConstructSkillEnv(config.task, config.obs_type, config.max_steps, config.light_robot)
+    try:
+        frames, success = demonstrate(env, expert, config.noise, seed, config.labels)
+        light_robot = env.light_robot
+    finally:
+        env.close()
+    outcome = Attempt(seed, success, len(frames), light_robot)
+    with staged(folder / str(seed)) as shard:
+        shard.mkdir()
+        if success:
+            _write_episode(config, [frame | {"task": task.instruction} for frame in frames], shard / EPISODE)
+        (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
+    return outcome
+
+
+def finished(folder: Path) -> dict[int, Attempt]:
+    """The attempts whose shards lie in `folder`, by seed."""
+    outcomes = [Attempt(**json.loads(path.read_text())) for path in folder.glob(f"*/{OUTCOME}")]
+    return {outcome.seed: outcome for outcome in outcomes}
+
+
+def _write_episode(config: GenerateConfig, frames: list[dict], root: Path) -> None:
+    import av
+    import datasets
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    # One progress bar is enough: these print one for every demonstration.
+    datasets.disable_progress_bars()
+    av.logging.set_libav_level(av.logging.ERROR)
+    os.environ.setdefault("SVT_LOG", "1")
+    dataset = LeRobotDataset.create(
+        repo_id=config.repo_id,
+        root=root,
+        fps=FPS,
+        robot_type="panda",
+        features=demonstration_features(get_task(config.task), config.obs_type),
+        rgb_encoder=RGBEncoderConfig(crf=18),
+        streaming_encoding=True,
+        # A demonstration is written at once; a shorter queue would drop frames that the encoder is late for.
+        encoder_queue_maxsize=config.max_steps,
+    )
+    for frame in frames:
+        dataset.add_frame(frame)
+    dataset.save_episode()
+    dataset.finalize()

@@ -1,0 +1,95 @@
+"""Which attempts are run and which shards are taken, with made-up attempts: neither simulator nor video."""
+
+import json
+import random
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+
+import pytest
+
+from lerobot_constructskill.demos import recorder, shards
+from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.demos.settings import frames_digest
+from lerobot_constructskill.demos.shards import Attempt
+
+CONFIG = GenerateConfig("local/set", episodes=6, seed_start=0)
+FAILS = {0, 3, 4, 8}
+
+
+@pytest.fixture
+def attempted(monkeypatch):
+    """The seeds that were run, in the order in which they ended; an attempt takes a few random milliseconds."""
+    seeds = []
+
+    def attempt(config, seed, folder):
+        time.sleep(random.random() / 100)
+        seeds.append(seed)
+        return Attempt(seed, seed not in FAILS, 10, True)
+
+    @contextmanager
+    def threads(executor, workers):
+        with ThreadPoolExecutor(workers) as pool:
+            yield pool.submit
+
+    monkeypatch.setattr(recorder, "attempt", attempt)
+    monkeypatch.setattr(recorder, "open_pool", threads)
+    return seeds
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 8])
+def test_the_first_successes_in_the_order_of_seeds_are_taken_whatever_the_workers(workers, attempted, tmp_path):
+    attempts = recorder._run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    assert [attempt.seed for attempt in attempts] == sorted(attempted) == list(range(10))
+    assert [attempt.seed for attempt in attempts if attempt.success] == [1, 2, 5, 6, 7, 9]
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, attempted, tmp_path):
+    for seed in (1, 4, 7, 50):
+        (tmp_path / str(seed)).mkdir()
+        (tmp_path / str(seed) / shards.OUTCOME).write_text(json.dumps(asdict(Attempt(seed, seed != 4, 10, True))))
+    (tmp_path / "5.partial" / "dataset").mkdir(parents=True)
+    (tmp_path / "5.partial" / "dataset" / shards.OUTCOME).touch()
+    attempts = recorder._run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    assert [attempt.seed for attempt in attempts] == list(range(10))
+    assert sorted(attempted) == [0, 2, 3, 5, 6, 8, 9]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"task": "block_to_bin"},
+        {"obs_type": "pixels_agent_pos"},
+        {"max_steps": 999},
+        {"light_robot": False},
+        {"labels": "executed"},
+        {"expert": ExpertConfig(gain=0.9)},
+        {"noise": NoiseConfig(sigma=0.02)},
+    ],
+)
+def test_shards_of_other_settings_are_elsewhere(change):
+    assert frames_digest(replace(CONFIG, **change)) != frames_digest(CONFIG)
+
+
+def test_shards_serve_more_episodes_other_names_and_any_number_of_workers():
+    changed = GenerateConfig("a/b", "c", episodes=7, max_failures=0.1, seed_start=3, workers=2, executor="ray")
+    assert frames_digest(changed) == frames_digest(CONFIG)
+
+
+def test_a_disk_that_is_too_small_is_told_before_anything_is_written(monkeypatch, tmp_path):
+    usage = type("Usage", (), {"free": 10_000_000})
+    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda folder: usage)
+    with pytest.raises(OSError, match="10 MB free and 6 episodes") as error:
+        record(replace(CONFIG, root=str(tmp_path / "deep" / "set")))
+    assert "\n" not in str(error.value) and list(tmp_path.iterdir()) == []
+
+
+def test_machines_that_draw_the_robot_differently_are_not_mixed(tmp_path):
+    from lerobot_constructskill.demos.merge import merge
+
+    with pytest.raises(ValueError, match="light_robot"):
+        merge(CONFIG, [Attempt(0, True, 10, True), Attempt(1, True, 10, False)], tmp_path, tmp_path / "set")
