@@ -1,6 +1,7 @@
 """Every shipped YAML is read by the class it is for, and says what it claims to say."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from lerobot_constructskill.demos.recorder import GenerateConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
+DOSE = sorted((CONFIGS / "dose").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
 
 
@@ -24,7 +26,7 @@ def generate_config(path: Path) -> GenerateConfig:
 def test_generation_configs_are_the_papers(path):
     config = generate_config(path)
     assert (config.task, config.episodes) == ("brick_to_bin", 80)
-    assert config.noise.sigma == (0.0 if path.stem.endswith("noise_free") else 0.01)
+    assert config.noise.root[0, 0] == (0.0 if path.stem.endswith("noise_free") else 0.01)
 
 
 @pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
@@ -32,6 +34,19 @@ def test_a_noise_free_twin_differs_in_its_noise_alone(path):
     twin = generate_config(path.with_stem(path.stem.removesuffix("_noise_free")))
     config = generate_config(path)
     assert replace(config, noise=twin.noise) == twin
+
+
+def test_executed_labels_differ_from_fast_in_the_labels_alone():
+    fast, executed = (generate_config(CONFIGS / "generate" / f"fast{end}.yaml") for end in ("", "_executed_labels"))
+    assert executed.labels == "executed" and replace(executed, labels="clean") == fast
+
+
+def test_the_dose_response_is_six_doses_of_fast():
+    fast = generate_config(CONFIGS / "generate" / "fast.yaml")
+    doses = {int(re.search(r"\d+", path.stem)[0]): generate_config(path) for path in DOSE}
+    assert list(doses) == [0, 2, 5, 10, 20, 30]
+    for millimetres, config in doses.items():
+        assert config == replace(fast, noise=replace(fast.noise, sigma=millimetres / 1000))
 
 
 @pytest.mark.parametrize("path", TRAIN, ids=lambda path: path.stem)

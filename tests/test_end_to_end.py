@@ -4,11 +4,15 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import draccus
+import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -108,6 +112,25 @@ def test_fine_tuning_and_evaluation_from_images_without_the_backbone_in_the_chec
     assert (saved / "model.safetensors").stat().st_size < 1e6
     one = ["--eval.n_episodes=1", "--eval.batch_size=1"]
     call("lerobot-eval", f"--policy.path={saved}", *ENV, *one, f"--output_dir={folder / 'small_eval'}")
+
+
+def test_dart_noise_is_fitted_to_a_policy_and_generates_the_next_set(trained, demonstrations, folder):
+    out, _ = trained
+    checkpoint, fitted = out / "checkpoints" / "000004" / "pretrained_model", folder / "dart.yaml"
+    root, repo_id = (flag.split("=")[1] for flag in demonstrations)
+    source = [f"--repo_id={repo_id}", f"--root={root}", "--episodes=[1]"]
+    flags = [f"--policy_path={checkpoint}", *source, f"--out={fitted}"]
+    subprocess.run([sys.executable, "-m", "lerobot_constructskill.scripts.fit_noise", *flags], check=True)
+    config = draccus.parse(GenerateConfig, fitted, args=["--repo_id=local/dart"])
+    assert config.noise.model == "dart" and config.noise.fitted_on["iteration"] == "1"
+    assert 0.0005 < np.sqrt(np.diag(config.noise.covariance)).max() < 0.1
+    assert config.obs_type == "pixels_agent_pos"
+    narrow = replace(config.noise, covariance=(np.array(config.noise.covariance) / 100).tolist())
+    next_set = folder / "dart"
+    record(replace(config, root=str(next_set), episodes=1, noise=narrow))
+    facts = json.loads((next_set / SIDECAR).read_text())
+    assert facts["generator"]["noise"]["fitted_on"] == config.noise.fitted_on
+    np.testing.assert_allclose(facts["noise_covariance"], narrow.covariance, atol=1e-12)
 
 
 def test_a_truncated_checkpoint_is_named_in_one_sentence(trained, folder):

@@ -1,0 +1,78 @@
+"""DART (Laskey et al. 2017): the noise covariance from a trained policy's error on held-out demonstrations.
+
+One iteration: train on the demonstrations, fit here, generate with the covariance that came out. The expert's states
+under that noise are then those that the policy's own errors lead to.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.pretrained import PreTrainedPolicy
+from tqdm import tqdm
+
+HELD_OUT_EVERY = 8
+"""Every eighth episode is held out, the last of each eight, as in every training configuration here."""
+
+
+def held_out(n_episodes: int) -> list[int]:
+    """Indices of the held-out episodes."""
+    return [index for index in range(n_episodes) if index % HELD_OUT_EVERY == HELD_OUT_EVERY - 1]
+
+
+def policy_errors(
+    policy: PreTrainedPolicy,
+    preprocess: Callable,
+    postprocess: Callable,
+    dataset: LeRobotDataset,
+    episode: int,
+    phases: list[str],
+) -> np.ndarray:
+    """The policy's translation minus the expert's, on the expert's own states, while the phase is one of `phases`.
+
+    Returns:
+        (n, 3) in metres
+    """
+    policy.reset()
+    row = dataset.meta.episodes[episode]
+    errors = []
+    for index in tqdm(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}", leave=False):
+        frame = dataset[index]
+        batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
+        with torch.inference_mode():
+            action = postprocess(policy.select_action(preprocess(batch | {"task": [frame["task"]]})))
+        if frame["phase"] in phases:
+            errors.append((action[0].float().cpu() - _clean_action(frame))[:3].numpy())
+    return np.array(errors, dtype=np.float64).reshape(-1, 3)
+
+
+def _clean_action(frame: dict) -> torch.Tensor:
+    clean = frame["dart.executed_action"].clone()
+    clean[:3] -= frame["dart.noise"]
+    return clean
+
+
+def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.ndarray:
+    """Mean over episodes of the mean of e e^T, which is large where the policy is biased too.
+
+    Args:
+        errors: one (n, 3) array per episode, in metres.
+        alpha: scale the covariance so that the squared error of an episode of mean length sums to this, in m2.
+
+    Returns:
+        (3, 3) in m2
+
+    Raises:
+        ValueError: no episode has an error, or alpha is not above 0.
+    """
+    errors = [error for error in errors if len(error)]
+    if not errors:
+        raise ValueError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
+    if alpha is not None and not alpha > 0:
+        raise ValueError(f"alpha must be above 0 m2, not {alpha}.")
+    covariance = np.mean([error.T @ error / len(error) for error in errors], axis=0)
+    if alpha is None:
+        return covariance
+    length = np.mean([len(error) for error in errors])
+    return covariance * alpha / (length * np.trace(covariance))

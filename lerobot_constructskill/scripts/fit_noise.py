@@ -1,0 +1,82 @@
+"""`constructskill-fit-noise`: one DART iteration, from a policy and held-out demonstrations to a new generation."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class FitNoiseConfig:
+    """Write the configuration of the next data set: that of the given one, with the noise fitted to a policy."""
+
+    policy_path: str  # a checkpoint's `pretrained_model` folder, or a name on the Hub
+    repo_id: str  # the demonstrations, with their images and phases
+    out: Path  # YAML to write, for constructskill-generate --config_path
+    root: Path | None = None  # the demonstrations' folder; LeRobot's cache when left out
+    episodes: list[int] | None = None  # held-out episodes; every eighth when left out
+    alpha: float | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
+    device: str | None = None  # default: a GPU where there is one
+
+
+def fit_noise(config: FitNoiseConfig) -> str:
+    """Fit, write `config.out` and return a line that says what came out.
+
+    Raises:
+        FileNotFoundError: the data set or the policy is not there.
+        ValueError: no such episodes, or nothing to fit on.
+    """
+    import numpy as np
+    import yaml
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_constructskill.demos.dart import fit_covariance, held_out, policy_errors
+
+    dataset = LeRobotDataset(config.repo_id, root=config.root)
+    generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
+    episodes = config.episodes or held_out(dataset.num_episodes)
+    if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
+        raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+    policy = _load_policy(config)
+    errors = [policy_errors(*policy, dataset, episode, generator["noise"]["phases"]) for episode in episodes]
+    covariance = fit_covariance(errors, config.alpha)
+    fitted_on = {
+        "policy": config.policy_path,
+        "dataset": config.repo_id,
+        "episodes": ",".join(map(str, episodes)),
+        "frames": str(sum(map(len, errors))),
+        "alpha": str(config.alpha),
+        "iteration": str(int((generator["noise"].get("fitted_on") or {}).get("iteration", 0)) + 1),
+    }
+    del generator["repo_id"]
+    generator["noise"] |= {"model": "dart", "covariance": covariance.tolist(), "fitted_on": fitted_on}
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    config.out.write_text(f"# DART iteration {fitted_on['iteration']}.\n{yaml.safe_dump(generator, sort_keys=False)}")
+    deviations = ", ".join(f"{1000 * value:.2f}" for value in np.sqrt(np.diag(covariance)))
+    return f"Noise of {deviations} mm (x, y, z) from {fitted_on['frames']} frames: {config.out}"
+
+
+def _load_policy(config: FitNoiseConfig) -> tuple:
+    """The policy and its pre- and postprocessor, as LeRobot loads them."""
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.utils.device_utils import auto_select_torch_device
+
+    import lerobot_constructskill.plugin  # noqa: F401
+
+    policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
+    policy_config.device = config.device or str(auto_select_torch_device())
+    policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
+    device = {"device_processor": {"device": policy_config.device}}
+    processors = make_pre_post_processors(policy_config, config.policy_path, preprocessor_overrides=device)
+    return policy.eval(), *processors
+
+
+def main() -> None:
+    run(FitNoiseConfig, fit_noise)
+
+
+if __name__ == "__main__":
+    main()
