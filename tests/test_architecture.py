@@ -25,6 +25,8 @@ ARROWS = {
     "demos.demonstrate": ("contract", "envs"),
     "demos.shards": ("contract", "envs", "staging"),
     "demos.recorder": ("contract", "staging"),
+    "data": ("contract", "demos"),
+    "data.replay": ("contract", "demos", "envs"),
     "features": ("contract", "policies"),
     "study": (),
     "study.plan": ("contract",),
@@ -35,7 +37,7 @@ ARROWS = {
     "study.agents": ("policies",),
     "study.simulators": ("envs",),
     "study.rollout": ("contract",),
-    "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features", "study"),
+    "scripts": ("contract", "staging", "plugin", "policies", "sim", "envs", "demos", "features", "study", "data"),
 }
 # Arrows of functions: the simulator is born on first use.
 LAZY_ARROWS = {"envs": ("sim",)}
@@ -131,7 +133,7 @@ def test_no_room_meets_environments_and_policies() -> None:
     rooms = {
         module: {room(found.target) for found in imports(path) if is_ours(found.target)}
         for module, path in SOURCES.items()
-        if room(module) in ("demos", "features", "envs", "policies")
+        if room(module) in ("demos", "data", "features", "envs", "policies")
     }
     both = {module for module, met in rooms.items() if {"envs", "policies"} <= met | {room(module)}}
     assert not both

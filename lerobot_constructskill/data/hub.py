@@ -1,0 +1,74 @@
+"""Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
+
+
+def locate(repo_id: str | None, root: Path | None, revision: str | None = None) -> Path:
+    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else what the Hub has.
+
+    Raises:
+        ValueError: neither a name nor a folder was given.
+        FileNotFoundError: the folder, or the data set on the Hub, is not there.
+    """
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    if root is not None:
+        if not root.is_dir():
+            raise FileNotFoundError(f"There is no folder {root}.")
+        return root
+    if repo_id is None:
+        raise ValueError("Name a data set with --repo_id, or its folder with --root.")
+    if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
+        return HF_LEROBOT_HOME / repo_id
+    return pull(repo_id, revision)
+
+
+def pull(repo_id: str, revision: str | None = None) -> Path:
+    """Bring a revision (LeRobot's version tag by default) into LeRobot's cache, or find it there without a network.
+
+    Raises:
+        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
+    """
+    from huggingface_hub import snapshot_download
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+    from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+
+    revision = revision or CODEBASE_VERSION
+    with one_sentence(repo_id, revision):
+        folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
+    return Path(folder)
+
+
+@contextmanager
+def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
+    """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
+    import httpx
+    from huggingface_hub import errors
+
+    try:
+        yield
+    except errors.RevisionNotFoundError:
+        reason = f"'{repo_id}' has no revision '{revision}' on the Hub."
+    except errors.RepositoryNotFoundError:
+        reason = f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
+    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled):
+        reason = f"The Hub cannot be reached and revision '{revision}' of '{repo_id}' is not in the cache."
+    except errors.HfHubHTTPError as error:
+        reason = _refusal(repo_id, error.response.status_code if error.response is not None else None)
+    except httpx.HTTPError:
+        reason = f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
+    else:
+        return
+    raise OSError(reason) from None
+
+
+def _refusal(repo_id: str, status: int | None) -> str:
+    if status == 401:
+        return f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"
+    if status == 403:
+        return f"The token of this machine may not write to '{repo_id}': use a name of your own."
+    return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."

@@ -1,0 +1,45 @@
+"""`constructskill-check`: is a data set, here or on the Hub, what it says it is? One line for each check."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class CheckConfig:
+    """Check a data set of demonstrations; exit status 1 where something is wrong."""
+
+    repo_id: str | None = None  # its name; pulled from the Hub unless root is given
+    root: Path | None = None  # its folder
+    revision: str | None = None  # tag, branch or commit on the Hub
+
+
+def check(config: CheckConfig) -> str:
+    """Print a line for each check and return the verdict.
+
+    Raises:
+        FileNotFoundError: there is no such data set.
+        ValueError: something is wrong with it, or neither a name nor a folder was given.
+    """
+    from lerobot_constructskill.data.checks import CHECKS, complaints
+    from lerobot_constructskill.data.dataset import open_dataset
+    from lerobot_constructskill.data.hub import locate
+
+    data = open_dataset(locate(config.repo_id, config.root, config.revision))
+    wrong = 0
+    for name, one in CHECKS.items():
+        found = complaints(data, one)
+        wrong += bool(found)
+        print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
+    if wrong:
+        raise ValueError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
+    return f"{len(data.episodes)} demonstrations, {len(data.rows)} frames: {len(CHECKS)} checks, nothing wrong."
+
+
+def main() -> None:
+    run(CheckConfig, check)
+
+
+if __name__ == "__main__":
+    main()
