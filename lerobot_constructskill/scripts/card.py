@@ -1,0 +1,46 @@
+"""`constructskill-card`: a data set's card and its two pictures, into its folder, from where they are pushed."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class CardConfig:
+    """Write README.md, pictures/contact_sheet.png and pictures/trajectories.png for a data set."""
+
+    root: Path  # the data set's folder
+    repo_id: str | None = None  # its name on the Hub; the one it was generated under when left out
+    out: Path | None = None  # where to write; into root when left out
+    facts: Path | None = None  # also write the card's facts as JSON here
+
+
+def write_card(config: CardConfig) -> str:
+    """Write the card and return a line that says where.
+
+    Raises:
+        FileNotFoundError: there is no data set in `root`.
+        ValueError: a file that cannot be read.
+    """
+    from lerobot_constructskill.data.card import describe, render
+    from lerobot_constructskill.data.dataset import open_dataset
+    from lerobot_constructskill.data.plots import contact_sheet, trajectories
+
+    data, out = open_dataset(config.root), config.out or config.root
+    facts = describe(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
+    contact_sheet(data, out / "pictures" / "contact_sheet.png")
+    trajectories(data, out / "pictures" / "trajectories.png")
+    (out / "README.md").write_text(render(facts))
+    if config.facts:
+        config.facts.write_text(json.dumps(facts, indent=2) + "\n")
+    return f"Card and pictures written to {out}"
+
+
+def main() -> None:
+    run(CardConfig, write_card)
+
+
+if __name__ == "__main__":
+    main()
