@@ -1,0 +1,77 @@
+"""What a number of seeds can show: power, the smallest difference that shows, rank reversals, seeds needed."""
+
+from functools import cache
+from math import ceil
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import binom
+from statsmodels.stats.power import NormalIndPower
+from statsmodels.stats.proportion import proportion_effectsize
+
+from lerobot_constructskill.study.stats.comparisons import fisher
+from lerobot_constructskill.study.stats.outcomes import Counts
+
+TARGET = 0.8
+"""The power that a study is planned for."""
+
+
+class Ranking(NamedTuple):
+    """Probabilities of what a study observes, of two variants whose true rates differ."""
+
+    right: float
+    tied: float
+    reversed: float
+
+
+def ranking(rate_a: float, rate_b: float, seeds: int) -> Ranking:
+    """How a study with `seeds` seeds a variant orders two variants of these true rates."""
+    higher, lower = max(rate_a, rate_b), min(rate_a, rate_b)
+    joint = _joint(higher, lower, seeds)
+    return Ranking(float(np.tril(joint, -1).sum()), float(np.trace(joint)), float(np.triu(joint, 1).sum()))
+
+
+def power(rate_a: float, rate_b: float, seeds: int, alpha: float = 0.05) -> float:
+    """Probability that Fisher's two-tailed test with `seeds` seeds an arm tells these rates apart, exactly.
+
+    Boschloo's has more; Fisher's is the one whose whole rejection region is quickly had.
+    """
+    return float(_joint(rate_a, rate_b, seeds)[_rejected(seeds, alpha)].sum())
+
+
+def detectable_difference(rate: float, seeds: int, alpha: float = 0.05) -> float | None:
+    """The smallest drop from `rate` that `seeds` seeds an arm show with 80 % power; None where even a drop to 0 hides.
+
+    A rise from 1 - `rate` is as hard to see.
+    """
+    if power(rate, 0.0, seeds, alpha) < TARGET:
+        return None
+    return float(brentq(lambda drop: power(rate, rate - drop, seeds, alpha) - TARGET, 0.0, rate, xtol=1e-4))
+
+
+def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> int | None:
+    """Seeds an arm that tell these rates apart with 80 % power; None where they are equal.
+
+    From the normal approximation on arcsine-transformed rates (Cohen 1988, section 6.4); an exact test needs a few
+    more.
+    """
+    effect = proportion_effectsize(rate_a, rate_b)
+    if rate_a == rate_b:
+        return None
+    return max(2, ceil(NormalIndPower().solve_power(effect, alpha=alpha, power=TARGET)))
+
+
+def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
+    """Probability of every pair of counts, (seeds + 1, seeds + 1)."""
+    counts = np.arange(seeds + 1)
+    return np.outer(binom.pmf(counts, seeds, rate_a), binom.pmf(counts, seeds, rate_b))
+
+
+@cache
+def _rejected(seeds: int, alpha: float) -> np.ndarray:
+    """Which pairs of counts Fisher's test rejects, bool (seeds + 1, seeds + 1)."""
+    rejected = np.zeros((seeds + 1, seeds + 1), dtype=bool)
+    for a, b in zip(*np.tril_indices(seeds + 1, -1), strict=True):
+        rejected[a, b] = rejected[b, a] = fisher(Counts(int(a), seeds), Counts(int(b), seeds)) < alpha
+    return rejected
