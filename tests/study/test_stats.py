@@ -18,7 +18,7 @@ from lerobot_constructskill.study.stats.correlation import kendall
 from lerobot_constructskill.study.stats.intervals import clopper_pearson, newcombe, wilson
 from lerobot_constructskill.study.stats.outcomes import Counts, count, seed_outcomes
 from lerobot_constructskill.study.stats.power import detectable_difference, power, ranking, seeds_needed
-from lerobot_constructskill.study.stats.spread import mean_rate, spread, spread_p_value
+from lerobot_constructskill.study.stats.spread import mean_p_value, mean_rate, spread, spread_p_value
 
 # Paper, Tables I and II: seeds that lifted, seeds that placed, seeds.
 BACKBONES = {"dinov2": (10, 7, 10), "clip": (6, 5, 10), "vit_tiny": (3, 1, 10), "vit_tiny_augreg": (2, 1, 10)}
@@ -171,8 +171,16 @@ def test_spread_test(rng):
     assert spread_p_value(np.repeat([1.0, 0.0], [15, 15]), np.full(30, 0.5), rng) < 0.001
 
 
-def test_spread_test_keeps_its_level(rng):
-    p_values = [spread_p_value(*rng.choice([0.0, 0.5, 1.0], (2, 4)), rng) for _ in range(200)]
+def test_mean_test(rng):
+    half, full = np.repeat([1.0, 0.0], [5, 5]), np.ones(10)
+    assert mean_p_value(half, full, rng) == pytest.approx(fisher(Counts(5, 10), Counts(10, 10)), abs=0.01)
+    assert mean_p_value(np.linspace(0, 0.2, 8), np.linspace(0.3, 0.5, 8), rng) < 0.01
+    assert mean_p_value(np.ones(1), np.zeros(1), rng) == 1
+
+
+@pytest.mark.parametrize("test", [mean_p_value, spread_p_value])
+def test_permutation_tests_keep_their_level(test, rng):
+    p_values = [test(*rng.choice([0.0, 0.5, 1.0], (2, 4)), rng) for _ in range(200)]
     assert np.mean(np.array(p_values) < 0.05) <= 0.08
 
 
@@ -185,7 +193,7 @@ def test_kendall_finds_order_and_none(rng):
 
 def test_kendall_needs_errors_and_outcomes_that_differ(rng):
     nothing = np.full(10, np.nan)
-    for error, success in [(nothing, np.arange(10)), (np.arange(10), np.ones(10)), (np.arange(2), np.arange(2))]:
+    for error, success in [(nothing, np.arange(10)), (np.arange(10), np.ones(10)), (np.arange(4), np.arange(4))]:
         assert kendall(error, success, rng) is None
     error = np.array([*range(9), np.nan])
     assert kendall(error, -error, rng) == kendall(error[:9], -error[:9], np.random.default_rng(0))

@@ -9,6 +9,9 @@ from lerobot_constructskill.study.stats.intervals import Estimate
 
 RESAMPLES = 999
 
+FEWEST = 5
+"""Runs below which no interval is worth its name."""
+
 
 def kendall(error: np.ndarray, success: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate | None:
     """Kendall's tau-b of held-out error and success over runs, with a percentile bootstrap interval over runs.
@@ -23,12 +26,12 @@ def kendall(error: np.ndarray, success: np.ndarray, rng: np.random.Generator, le
         level: of the interval.
 
     Returns:
-        None where fewer than three runs are left, or all have the same error or the same success.
+        None where fewer than `FEWEST` runs are left, or all have the same error or the same success.
     """
     error, success = np.asarray(error, dtype=float), np.asarray(success, dtype=float)
     kept = np.isfinite(error) & np.isfinite(success)
     error, success = error[kept], success[kept]
-    if len(error) < 3 or np.ptp(error) == 0 or np.ptp(success) == 0:
+    if len(error) < FEWEST or np.ptp(error) == 0 or np.ptp(success) == 0:
         return None
     value = float(kendalltau(error, success).statistic)
     draws = _resampled(error, success, rng)

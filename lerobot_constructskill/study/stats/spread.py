@@ -5,13 +5,15 @@ in all its episodes or in none, the standard deviation is sqrt(p (1 - p)) of its
 nearly always succeeds varies little: spread has to be read beside the mean.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.stats import permutation_test
 
 from lerobot_constructskill.study.stats.intervals import Estimate
 
 DRAWS = 4000
-PERMUTATIONS = 9999
+PERMUTATIONS = 1999
 
 
 def mean_rate(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate:
@@ -35,8 +37,16 @@ def spread(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> 
     return _estimate(float(rates.std()), _posterior(rates, rng)[1], level)
 
 
+def mean_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
+    """Permutation test, two-tailed, of the difference of a's and b's mean over seeds. Arguments of `spread_p_value`.
+
+    For settings in which a seed succeeds in some of its episodes, where "at least once" says little.
+    """
+    return _permuted(np.mean, a, b, rng)
+
+
 def spread_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
-    """Permutation test, two-tailed, of a's and b's spread: the statistic is the difference of standard deviations.
+    """Permutation test, two-tailed, of the difference of a's and b's standard deviation over seeds.
 
     Seeds are exchanged between the arms, so that a small p speaks against equal distributions, in their spread; for
     all-or-nothing seeds it cannot be smaller than what the counts allow. Tests on centred values can: ten equal seeds
@@ -46,20 +56,21 @@ def spread_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> fl
         a, b: share in [0, 1] of each seed, (seeds,) each.
         rng: source of the permutations where there are too many to try all.
     """
+    return _permuted(np.std, a, b, rng)
+
+
+def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
+    def difference(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        # Rounded, or equal statistics would be told apart by their last bit.
+        return np.abs(statistic(x, axis=axis) - statistic(y, axis=axis)).round(12)
+
+    arms = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if min(map(len, arms)) < 2:
+        return 1.0  # scipy refuses a single seed, which tells nothing of the others
     result = permutation_test(
-        (np.asarray(a, dtype=float), np.asarray(b, dtype=float)),
-        _difference,
-        vectorized=True,
-        alternative="greater",
-        n_resamples=PERMUTATIONS,
-        rng=rng,
+        arms, difference, vectorized=True, alternative="greater", n_resamples=PERMUTATIONS, rng=rng
     )
     return float(result.pvalue)
-
-
-def _difference(a: np.ndarray, b: np.ndarray, axis: int) -> np.ndarray:
-    # Rounded, or equal deviations would be told apart by their last bit.
-    return np.abs(a.std(axis=axis) - b.std(axis=axis)).round(12)
 
 
 def _posterior(rates: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
