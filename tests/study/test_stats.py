@@ -5,6 +5,7 @@ from itertools import combinations
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import kendalltau
 
 from lerobot_constructskill.study.stats.comparisons import (
     Verdict,
@@ -14,7 +15,7 @@ from lerobot_constructskill.study.stats.comparisons import (
     holm,
     probability_better,
 )
-from lerobot_constructskill.study.stats.correlation import kendall
+from lerobot_constructskill.study.stats.correlation import _tau_b, kendall
 from lerobot_constructskill.study.stats.intervals import clopper_pearson, newcombe, wilson
 from lerobot_constructskill.study.stats.outcomes import Counts, count, seed_outcomes
 from lerobot_constructskill.study.stats.power import detectable_difference, power, ranking, seeds_needed
@@ -189,6 +190,11 @@ def test_kendall_finds_order_and_none(rng):
     assert kendall(error, -error, rng).value == pytest.approx(-1)
     estimate = kendall(error, np.tile([0.0, 10.0], 10), rng)
     assert -1 <= estimate.low < 0 < estimate.high <= 1
+
+
+def test_resampled_tau_is_scipys(rng):
+    x, y = rng.integers(0, 4, (2, 5, 12)).astype(float)
+    assert _tau_b(x, y, -1) == pytest.approx([kendalltau(a, b).statistic for a, b in zip(x, y, strict=True)])
 
 
 def test_kendall_needs_errors_and_outcomes_that_differ(rng):

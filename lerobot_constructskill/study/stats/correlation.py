@@ -45,11 +45,19 @@ def _resampled(error: np.ndarray, success: np.ndarray, rng: np.random.Generator)
         warnings.simplefilter("ignore")
         draws = bootstrap(
             (error, success),
-            lambda x, y: kendalltau(x, y).statistic,
+            _tau_b,
             paired=True,
-            vectorized=False,
+            vectorized=True,
             n_resamples=RESAMPLES,
+            batch=100,
             method="percentile",
             rng=rng,
         ).bootstrap_distribution
     return draws[np.isfinite(draws)]
+
+
+def _tau_b(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+    """What `kendalltau` computes, over the last axis of stacked samples: it takes one sample, in 0.3 ms."""
+    signs = [np.sign(values[..., :, None] - values[..., None, :]) for values in (x, y)]
+    concordance, *untied = ((a * b).sum((-2, -1)) for a, b in ((signs[0], signs[1]), (signs[0],) * 2, (signs[1],) * 2))
+    return concordance / np.sqrt(untied[0] * untied[1])

@@ -1,6 +1,7 @@
 """What a number of seeds can show: power, the smallest difference that shows, rank reversals, seeds needed."""
 
-from functools import cache
+from bisect import bisect_left
+from functools import cache, partial
 from math import ceil
 from typing import NamedTuple
 
@@ -72,6 +73,11 @@ def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
 def _rejected(seeds: int, alpha: float) -> np.ndarray:
     """Which pairs of counts Fisher's test rejects, bool (seeds + 1, seeds + 1)."""
     rejected = np.zeros((seeds + 1, seeds + 1), dtype=bool)
-    for a, b in zip(*np.tril_indices(seeds + 1, -1), strict=True):
-        rejected[a, b] = rejected[b, a] = fisher(Counts(int(a), seeds), Counts(int(b), seeds)) < alpha
-    return rejected
+    for a in range(seeds + 1):
+        # The closer b comes to a, the larger is p.
+        rejected[a, : bisect_left(range(a), True, key=partial(_kept, a, seeds=seeds, alpha=alpha))] = True
+    return rejected | rejected.T
+
+
+def _kept(a: int, b: int, seeds: int, alpha: float) -> bool:
+    return fisher(Counts(a, seeds), Counts(b, seeds)) >= alpha
