@@ -47,6 +47,7 @@ EXTERNALS = {
     "contract": set(),
     "staging": set(),
     "study.stats": {"numpy", "pandas", "scipy", "statsmodels"},
+    "study.report": {"draccus", "jinja2", "markupsafe", "matplotlib", "numpy", "pandas", "yaml"},
 }
 
 

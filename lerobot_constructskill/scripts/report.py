@@ -1,0 +1,37 @@
+"""`constructskill-report`: tables, figures and a page from the rows of a study."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class ReportConfig:
+    """Write report.html, report.md and figures/ into a study's folder.
+
+    The folder holds plan.yaml and rows.parquet, and may hold provenance.json, one JSON object of names and values to
+    show. A study need not be complete.
+    """
+
+    root: Path
+
+
+def report(config: ReportConfig) -> Path:
+    """Write a report and return its page.
+
+    Raises:
+        FileNotFoundError: the folder holds no study.
+        ValueError: its files cannot be read, or its rows are another plan's.
+    """
+    from lerobot_constructskill.study.report.page import write_report
+
+    return write_report(config.root)
+
+
+def main() -> None:
+    run(ReportConfig, lambda config: f"Report written to {report(config)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,136 @@
+"""What a study says, in sentences made from its findings: the paragraph at the top of a report."""
+
+from lerobot_constructskill.study.report.findings import Findings, Line, SettingFindings
+from lerobot_constructskill.study.report.wording import episodes, listed, plural, seeds, share_range, tau
+from lerobot_constructskill.study.stats.comparisons import Comparison, Verdict
+
+SOLVED = 0.9
+"""Share of episodes from which on a reference counts as solving a setting."""
+
+SIGHTLESS = {"replay": "replaying one demonstration open loop", "blind": "a policy that sees a constant image"}
+"""References that do not look, as the subject of a sentence."""
+
+
+def answer(findings: Findings) -> list[tuple[str, str]]:
+    """(setting's label, its paragraph) for every setting."""
+    plan = findings.plan
+    return [(setting.label, _paragraph(setting, plan.episodes, plan.alpha)) for setting in findings.settings]
+
+
+def status(findings: Findings) -> str | None:
+    """What is missing or failed, one sentence or two; None where nothing is."""
+    total = len(findings.plan.runs)
+    sentences = []
+    if findings.missing:
+        sentences.append(
+            f"{findings.missing} of {plural(total, 'run')} {'is' if findings.missing == 1 else 'are'} missing: every "
+            "number below is provisional."
+        )
+    if findings.missing_references:
+        names = listed([f"{label} ({setting})" for setting, label in findings.missing_references])
+        sentences.append(f"References without a result: {names}.")
+    if findings.failed:
+        count = "counts as a seed" if findings.failed == 1 else "count as seeds"
+        sentences.append(f"{plural(findings.failed, 'run')} failed and {count} that met no criterion.")
+    return " ".join(sentences) or None
+
+
+def _paragraph(setting: SettingFindings, n_episodes: int, alpha: float) -> str:
+    lines = [line for line in setting.lines if line.outcomes]
+    if not lines:
+        return "No run has finished."
+    sentences = [
+        _best(lines, n_episodes),
+        _verdicts(setting, "lifted", "Lifting"),
+        _verdicts(setting, "placed", "Placing"),
+        _shares(setting, alpha),
+        _offline_error(setting),
+        _sightless(setting, n_episodes),
+    ]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _best(lines: list[Line], n_episodes: int) -> str:
+    most_seeds = max(line.seeds for line in lines)
+    rivals = [line for line in lines if line.seeds == most_seeds]
+    top = max(line.outcomes["placed"].mean.value for line in rivals)
+    if top == 0:
+        return f"No variant placed the object in any of its seeds; {_lifts(rivals)}."
+    best = [line for line in rivals if line.outcomes["placed"].mean.value == top]
+    placed = best[0].outcomes["placed"]
+    each = " each" if len(best) > 1 else ""
+    rank = f", the most of {len(rivals)} variants with {seeds(most_seeds)}" if len(rivals) > len(best) else ""
+    return (
+        f"{listed([line.label for line in best])} placed the object in {placed.counts.met} of "
+        f"{seeds(placed.counts.seeds)}{each} (95 % interval {share_range(placed.exact)}), "
+        f"in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
+    )
+
+
+def _lifts(lines: list[Line]) -> str:
+    best = max(lines, key=lambda line: line.outcomes["lifted"].mean.value)
+    counts = best.outcomes["lifted"].counts
+    return f"the most that any lifted it is {counts.met} of {seeds(counts.seeds)}, by {best.label}"
+
+
+def _verdicts(setting: SettingFindings, criterion: str, noun: str) -> str:
+    comparisons = setting.comparisons[criterion]
+    if not comparisons:
+        return ""
+    decided = [_ordered(pair) for pair in comparisons if pair.verdict in (Verdict.BETTER, Verdict.WORSE)]
+    alike = sum(pair.verdict is Verdict.ALIKE for pair in comparisons)
+    undecided = len(comparisons) - len(decided) - alike
+    parts = [_beats(decided, setting)] if decided else []
+    if alike:
+        parts.append(f"{plural(alike, 'pair')} {'is' if alike == 1 else 'are'} alike within 20 points")
+    if undecided:
+        share = f"{undecided} of " if undecided < len(comparisons) else "all " if undecided > 1 else "the "
+        verb = "is" if undecided == 1 else "are"
+        number = "" if share == "the " else f"{len(comparisons)} "
+        noun_form = "comparison" if len(comparisons) == 1 else "comparisons"
+        parts.append(f"{share}{number}declared {noun_form} {verb} {Verdict.INCONCLUSIVE}")
+    return f"{noun}: {'; '.join(parts)}."
+
+
+def _ordered(pair: Comparison) -> tuple[str, str]:
+    return (pair.a, pair.b) if pair.verdict is Verdict.BETTER else (pair.b, pair.a)
+
+
+def _beats(pairs: list[tuple[str, str]], setting: SettingFindings) -> str:
+    """ "a beats b and c; d beats c"."""
+    losers: dict[str, list[str]] = {}
+    for winner, loser in pairs:
+        losers.setdefault(winner, []).append(setting.labels[loser])
+    return "; ".join(f"{setting.labels[winner]} beats {listed(beaten)}" for winner, beaten in losers.items())
+
+
+def _shares(setting: SettingFindings, alpha: float) -> str:
+    """By share of episodes, where seeds are not all-or-nothing and "at least once" says little."""
+    tests = [test for test in setting.rate_tests["placed"] if test.mean_holm < alpha]
+    if setting.all_or_nothing or not setting.rate_tests["placed"]:
+        return ""
+    pairs = [(test.a, test.b) if test.mean > 0 else (test.b, test.a) for test in tests]
+    found = _beats(pairs, setting) if pairs else "no pair is told apart"
+    return f"Seeds succeed in some of their episodes here; by mean episodes placed, {found}."
+
+
+def _offline_error(setting: SettingFindings) -> str:
+    estimate = setting.correlations["placed"][0][1] if setting.correlations["placed"] else None
+    if estimate is None:
+        return ""
+    if estimate.low <= 0 <= estimate.high:
+        return f"Held-out error does not tell which runs place ({tau(estimate)})."
+    direction = "lower" if estimate.value < 0 else "higher"
+    return f"Runs with {direction} held-out error place more often ({tau(estimate)})."
+
+
+def _sightless(setting: SettingFindings, n_episodes: int) -> str:
+    solving = [
+        f"{SIGHTLESS[line.name]} places in {episodes(line.outcomes['placed'].mean.value, n_episodes)}"
+        for line in setting.references
+        if line.name in SIGHTLESS and line.outcomes and line.outcomes["placed"].mean.value >= SOLVED
+    ]
+    if not solving:
+        return ""
+    sentence = f"{listed(solving)}, so success here does not show that a policy sees."
+    return sentence[0].upper() + sentence[1:]
