@@ -17,6 +17,7 @@ ten-seeds: setup ## ten training seeds of frozen_vit on the fast set, lift and p
 	@SEEDS="0 1 2 3 4 5 6 7 8 9" examples/demo.sh
 
 test: setup ## every test
+	@./setup.sh browser
 	$(PARALLEL)
 
 check: setup ## lint, and the tests that need neither simulator nor training

@@ -2,6 +2,7 @@
 # Makes .venv/ and what it needs from the system. Safe to run again: it does nothing where nothing is to do.
 #   ./setup.sh         set up (`make setup`)
 #   ./setup.sh pins    renew constraints.txt (`make pins`)
+#   ./setup.sh browser install the Chromium that the report's test looks through (`make test`)
 set -euo pipefail
 
 PYTHON_VERSION=3.12
@@ -151,6 +152,17 @@ install_system() {
     install_lavapipe || warn "apt-get could not install mesa-vulkan-drivers; the simulator renders on a GPU alone."
 }
 
+# Only tests want it, so that doing without is a warning and a skipped test.
+setup_browser() {
+    chromium --version >/dev/null 2>&1 && return 0
+    if command -v apt-get >/dev/null && can_be_root; then
+        say "installing chromium, for the report's browser test"
+        as_root apt-get update -qq || true
+        apt_install chromium || true
+    fi
+    chromium --version >/dev/null 2>&1 || warn "no Chromium here; the report's browser test will be skipped."
+}
+
 # --- Python ----------------------------------------------------------------------------------------------------
 
 # Only running it tells: a pyenv shim named python3.12 can be on PATH and have no Python behind it.
@@ -267,7 +279,8 @@ main() {
             say "ready (.venv/)"
             ;;
         pins) renew_pins ;;
-        *) die "unknown argument '$1'; it takes none, or 'pins'." ;;
+        browser) setup_browser ;;
+        *) die "unknown argument '$1'; it takes none, 'pins' or 'browser'." ;;
     esac
 }
 

@@ -1,0 +1,63 @@
+"""The report in a real browser: only tables and figures scroll sideways, nothing is fetched or complained of."""
+
+import shutil
+import subprocess
+
+import pytest
+from synthetic_study import study_rows, write_study
+
+from lerobot_constructskill.study.report.page import write_report
+
+
+def find_chromium() -> str | None:
+    """A Chromium that starts: Ubuntu's apt package is a stand-in that asks for snap."""
+    for name in ("chromium", "google-chrome", "chromium-browser"):
+        path = shutil.which(name)
+        if path and subprocess.run([path, "--version"], capture_output=True).returncode == 0:
+            return path
+    return None
+
+
+CHROMIUM = find_chromium()
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here; `make test` installs it where apt has it"),
+]
+
+OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+IMAGES = "[...document.images].filter(image => !(image.complete && image.naturalWidth > 0)).length"
+CUT = """[...document.querySelectorAll(".scroll")].filter(box =>
+    box.getBoundingClientRect().right > innerWidth + 1 || box.getBoundingClientRect().left < 0).length"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory) -> str:
+    return write_report(write_study(tmp_path_factory.mktemp("study"), rows=study_rows())).as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1280])
+def test_page(address, browser, width, scheme):
+    page = browser.new_page(viewport={"width": width, "height": 844}, color_scheme=scheme)
+    said, asked = [], []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(address)
+    assert page.evaluate(OVERFLOW) == 0
+    assert page.evaluate(CUT) == 0
+    assert page.evaluate(IMAGES) == 0
+    assert page.locator("table").count() > 5
+    assert said == []
+    assert [url for url in asked if not url.startswith("data:")] == [address]
+    page.close()
