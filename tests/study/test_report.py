@@ -156,6 +156,7 @@ def test_a_variant_that_could_not_run_is_never_a_zero(tmp_path):
     assert one.outcomes["placed"].counts.met == 1
     assert not two.outcomes and "not available" in two.absence
     assert findings.settings[0].comparisons["placed"] == []
+    assert status(findings) == "No run of two (fixed) finished."
     report(ReportConfig(tmp_path))
     assert "| two | no run finished: The weights are not available. |" in (tmp_path / "report.md").read_text()
 

@@ -138,6 +138,8 @@ def test_what_can_be_detected_is_detected():
     needed = seeds_needed(1.0, 0.5)
     assert seeds_needed(0.5, 1.0) == needed > seeds_needed(1.0, 0.2)
     assert seeds_needed(0.3, 0.3) is None
+    over_rates = [seeds_needed(1.0, rate / 30) for rate in range(30)]
+    assert over_rates == sorted(over_rates) and over_rates[0] >= 2
 
 
 def test_rank_reversals():

@@ -29,9 +29,16 @@ def status(findings: Findings) -> str | None:
     if findings.missing_references:
         names = listed([f"{label} ({setting})" for setting, label in findings.missing_references])
         sentences.append(f"References without a result: {names}.")
-    if findings.failed:
-        count = "counts as a seed" if findings.failed == 1 else "count as seeds"
-        sentences.append(f"{plural(findings.failed, 'run')} failed and {count} that met no criterion.")
+    failed = sum(setting.failed_seeds for setting in findings.settings)
+    if failed:
+        count = "counts as a seed" if failed == 1 else "count as seeds"
+        sentences.append(f"{plural(failed, 'run')} failed and {count} that met no criterion.")
+    sentences += [
+        f"No run of {line.label} ({setting.label}) finished."
+        for setting in findings.settings
+        for line in (*setting.lines, *setting.references)
+        if line.failed and not line.outcomes
+    ]
     return " ".join(sentences) or None
 
 

@@ -62,6 +62,10 @@ class Line:
     error: Estimate | None
 
     @property
+    def failed(self) -> int:
+        return int(self.runs["error"].notna().sum())
+
+    @property
     def absence(self) -> str:
         """Why there are no outcomes."""
         reasons = self.runs["error"].dropna()
@@ -131,10 +135,18 @@ class SettingFindings:
         return {line.name: line.label for line in (*self.lines, *self.references)}
 
     @property
-    def failures(self) -> list[tuple[str, int, str]]:
-        """(label, seed, error) of every failed run."""
-        lines = [(line.label, line.runs[line.runs["error"].notna()]) for line in (*self.lines, *self.references)]
-        return [(label, int(run.training_seed), str(run.error)) for label, runs in lines for run in runs.itertuples()]
+    def failures(self) -> list[tuple[str, list[int], str]]:
+        """(label, seeds, error) of the failed runs."""
+        return [
+            (line.label, [int(seed) for seed in runs["training_seed"]], str(error))
+            for line in (*self.lines, *self.references)
+            for error, runs in line.runs.groupby("error", sort=False)
+        ]
+
+    @property
+    def failed_seeds(self) -> int:
+        """Failed runs among runs that finished: they count as seeds that met no criterion."""
+        return sum(line.failed for line in (*self.lines, *self.references) if line.outcomes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,10 +166,6 @@ class Findings:
     missing: int
     missing_references: list[tuple[str, str]]
     repeated: tuple[int, int]
-
-    @property
-    def failed(self) -> int:
-        return sum(len(setting.failures) for setting in self.settings)
 
 
 def collect(plan: StudyPlan, rows: pd.DataFrame) -> Findings:

@@ -2,13 +2,13 @@
 
 from bisect import bisect_left
 from functools import cache, partial
-from math import ceil
+from math import ceil, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import binom
-from statsmodels.stats.power import NormalIndPower
+from statsmodels.stats.power import normal_sample_size_one_tail
 from statsmodels.stats.proportion import proportion_effectsize
 
 from lerobot_constructskill.study.stats.comparisons import fisher
@@ -57,10 +57,10 @@ def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> int | Non
     From the normal approximation on arcsine-transformed rates (Cohen 1988, section 6.4); an exact test needs a few
     more.
     """
-    effect = proportion_effectsize(rate_a, rate_b)
     if rate_a == rate_b:
         return None
-    return max(2, ceil(NormalIndPower().solve_power(effect, alpha=alpha, power=TARGET)))
+    effect = proportion_effectsize(rate_a, rate_b)  # its estimate from n seeds an arm has the deviation sqrt(2 / n)
+    return max(2, ceil(normal_sample_size_one_tail(effect, TARGET, alpha / 2, std_null=sqrt(2))))
 
 
 def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
