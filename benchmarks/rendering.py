@@ -1,7 +1,7 @@
 """RGB environment steps per second at 224 x 224 in one process: our scene, ours with original meshes, PickCube-v1.
 
-The three are stepped in turn, a block of steps each, so that a change of the machine's load meets all of them. PyTorch
-gets one thread in each: the simulator's tensors are tiny, and waking a second thread for them costs more than it gives.
+The three are stepped in turn, a block of steps each, so that a change of the machine's load meets all of them.
+PyTorch gets one thread: the simulator's tensors are tiny, and waking a second one for them costs more than it gives.
 """
 
 import gymnasium as gym
