@@ -47,23 +47,34 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
 def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
     import httpx
-    from huggingface_hub import errors
 
     try:
         yield
-    except errors.RevisionNotFoundError:
-        reason = f"'{repo_id}' has no revision '{revision}' on the Hub."
-    except errors.RepositoryNotFoundError:
-        reason = f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
-    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled):
-        reason = f"The Hub cannot be reached and revision '{revision}' of '{repo_id}' is not in the cache."
-    except errors.HfHubHTTPError as error:
-        reason = _refusal(repo_id, error.response.status_code if error.response is not None else None)
-    except httpx.HTTPError:
-        reason = f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
-    else:
-        return
-    raise OSError(reason) from None
+    except (OSError, RuntimeError, httpx.HTTPError) as error:
+        # An upload's own error is the cause of a bare RuntimeError.
+        reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
+        if reason is None:
+            raise
+        raise OSError(reason) from None
+
+
+def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
+    import httpx
+    from huggingface_hub import errors
+
+    if isinstance(error, errors.RevisionNotFoundError):
+        return f"'{repo_id}' has no revision '{revision}' on the Hub."
+    if isinstance(error, errors.RepositoryNotFoundError):
+        return f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
+    if isinstance(error, errors.LocalEntryNotFoundError):
+        return f"The Hub cannot be reached and revision '{revision}' of '{repo_id}' is not in the cache."
+    if isinstance(error, errors.OfflineModeIsEnabled):
+        return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
+    if isinstance(error, errors.HfHubHTTPError):
+        return _refusal(repo_id, error.response.status_code)
+    if isinstance(error, httpx.HTTPError):
+        return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
+    return None
 
 
 def _refusal(repo_id: str, status: int | None) -> str:
@@ -72,3 +83,35 @@ def _refusal(repo_id: str, status: int | None) -> str:
     if status == 403:
         return f"The token of this machine may not write to '{repo_id}': use a name of your own."
     return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."
+
+
+def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
+    """Put the folder of a data set on the Hub, in one commit, and tag it; return the commit's address.
+
+    Interrupted, the same call continues: the Hub keeps the files that arrived. The tag is set last, so what has one is
+    whole.
+
+    Args:
+        tag: a version of the data set, beside LeRobot's own tag, without which LeRobot loads nothing.
+        update: replace a data set that is whole, and move its tags.
+
+    Raises:
+        FileExistsError: the name holds a whole data set and `update` is not set.
+        OSError: the Hub cannot be reached, or refuses the token or the name.
+    """
+    from huggingface_hub import HfApi
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+
+    api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
+    with one_sentence(repo_id):
+        api.create_repo(**repo, private=private, exist_ok=True)
+        tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
+        if CODEBASE_VERSION in tagged and not update:
+            raise FileExistsError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
+        stale = ["data/*", "videos/*", "meta/*"]
+        commit = api.upload_folder(**repo, folder_path=root, ignore_patterns=[".cache/*"], delete_patterns=stale)
+        for name in filter(None, (CODEBASE_VERSION, tag)):
+            if name in tagged:
+                api.delete_tag(**repo, tag=name)
+            api.create_tag(**repo, tag=name)
+    return commit.commit_url

@@ -1,0 +1,51 @@
+"""`constructskill-push`: a data set onto the Hub, checked before it leaves the machine."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class PushConfig:
+    """Check a data set, write its card where it has none, put it on the Hub in one commit and tag it.
+
+    Interrupted, the same command continues.
+    """
+
+    repo_id: str  # its name on the Hub, user/name
+    root: Path  # its folder
+    private: bool = False  # whether only its owner sees it
+    tag: str | None = None  # a version of its own, beside LeRobot's tag
+    update: bool = False  # replace a data set that is there already
+
+
+def push_dataset(config: PushConfig) -> str:
+    """Push and return the commit's address.
+
+    Raises:
+        FileNotFoundError: there is no data set in `root`.
+        FileExistsError: the name is taken and `update` is not set.
+        ValueError: a check found something wrong.
+        OSError: the Hub refused, or the connection broke.
+    """
+    from lerobot_constructskill.data.checks import CHECKS, complaints
+    from lerobot_constructskill.data.dataset import open_dataset
+    from lerobot_constructskill.data.hub import push
+    from lerobot_constructskill.scripts.card import CardConfig, write_card
+
+    data = open_dataset(config.root)
+    wrong = [f"{name}: {complaint}" for name, check in CHECKS.items() for complaint in complaints(data, check)]
+    if wrong:
+        raise ValueError(f"{config.root} is not pushed, because of {len(wrong)} complaints; {wrong[0]}")
+    if not (config.root / "README.md").is_file():
+        print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
+    return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"
+
+
+def main() -> None:
+    run(PushConfig, push_dataset)
+
+
+if __name__ == "__main__":
+    main()

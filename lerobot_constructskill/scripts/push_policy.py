@@ -1,0 +1,72 @@
+"""`constructskill-push-policy`: a trained policy onto the Hub by LeRobot's own push, its outcomes on the card."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class PushPolicyConfig:
+    """Push a checkpoint with LeRobot's card and, on it, lift and place counts of every evaluated training seed."""
+
+    policy_path: Path  # a checkpoint's `pretrained_model` folder
+    evaluations: Path  # folder of seed_*/eval_info.json, as lerobot-eval writes them
+    repo_id: str  # its name on the Hub, user/name
+    private: bool = False  # whether only its owner sees it
+    task: str = "brick_to_bin"  # what it was evaluated in
+
+    def __post_init__(self):
+        get_task(self.task)
+
+
+def push_policy(config: PushPolicyConfig) -> str:
+    """Push and return the name.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint, or no evaluation.
+        OSError: the Hub refused, or the connection broke.
+    """
+    from lerobot_constructskill.data.hub import one_sentence
+    from lerobot_constructskill.data.policy_card import render_outcomes, seed_outcomes
+
+    train, policy = (_read(config.policy_path / name) for name in ("train_config.json", "config.json"))
+    section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
+    with one_sentence(config.repo_id):
+        _push(config, section)
+    return f"Pushed: {config.repo_id}"
+
+
+def _read(path: Path) -> dict:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} is missing: name a checkpoint's pretrained_model folder.")
+    return json.loads(path.read_text())
+
+
+def _push(config: PushPolicyConfig, section: str) -> None:
+    from huggingface_hub import ModelCard
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+    import lerobot_constructskill.plugin  # noqa: F401
+
+    policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
+    policy_config.repo_id, policy_config.private, policy_config.device = config.repo_id, config.private, "cpu"
+    policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
+    policy.push_model_to_hub(TrainPipelineConfig.from_pretrained(config.policy_path))
+    for processor in make_pre_post_processors(policy_config, str(config.policy_path)):
+        processor.push_to_hub(config.repo_id)
+    card = ModelCard.load(config.repo_id)
+    card.text += section
+    card.push_to_hub(config.repo_id)
+
+
+def main() -> None:
+    run(PushPolicyConfig, push_policy)
+
+
+if __name__ == "__main__":
+    main()
