@@ -102,12 +102,13 @@ class ConstructSkillEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode whose initial state is a function of `seed` alone; unknown `options` are ignored."""
+        """Start an episode that is a function of `seed` and actions alone; unknown `options` are ignored."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
+        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.2 s.
+        obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
-        obs, info = self._ensure_env().reset(seed=seed)
         return self._observation(obs), self._info(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:

@@ -14,6 +14,10 @@ from lerobot.envs.utils import (
 )
 
 from lerobot_constructskill.contract import ACTION_SCALE, IMAGE_SIZE, OBS_TYPES, TASKS
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.pick_place import PickPlaceExpert
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
@@ -175,3 +179,17 @@ def test_a_machine_without_a_vulkan_device_is_told_so_in_one_sentence():
     assert run.returncode != 0
     last = run.stderr.strip().splitlines()[-1]
     assert "No Vulkan device" in last and "make setup" in last
+
+
+@pytest.mark.sim
+def test_an_episode_does_not_remember_the_one_before_it():
+    """The expert's episode, contacts and all, twice in one environment."""
+    env, episodes = ConstructSkillEnv(), []
+    for _ in range(2):
+        frames, success = demonstrate(env, PickPlaceExpert(ExpertConfig()), NoiseConfig(), seed=5)
+        episodes.append(frames)
+        assert success
+    env.close()
+    for first, second in zip(*episodes, strict=True):
+        np.testing.assert_array_equal(first["sim.object_pose"], second["sim.object_pose"])
+        np.testing.assert_array_equal(first["observation.images.base"], second["observation.images.base"])
