@@ -18,7 +18,8 @@ from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.plan import StudyPlan
 from lerobot_constructskill.study.report import figures, wording
 from lerobot_constructskill.study.report.answer import answer, status
-from lerobot_constructskill.study.report.findings import Findings, SettingFindings, collect
+from lerobot_constructskill.study.report.collect import collect
+from lerobot_constructskill.study.report.findings import Findings, SettingFindings
 from lerobot_constructskill.study.report.ink import DARK, LIGHT, Drawing
 from lerobot_constructskill.study.report.provenance import Film, extra_facts, films, provenance
 from lerobot_constructskill.study.rows import read_rows

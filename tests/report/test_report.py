@@ -1,7 +1,5 @@
 """The report of studies that were never run: what it says, what it refuses, and that nothing in it is markup."""
 
-import dataclasses
-import json
 import re
 import subprocess
 import sys
@@ -9,18 +7,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from synthetic_study import PLAN, RATES, VIT, episode_rows, failed_row, study_rows, write_study
+from synthetic_study import HOSTILE, PLAN, RATES, VIT, episode_rows, failed_row, study_rows, write_study
 
 from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.study.plan import Setting, StudyPlan, Variant
 from lerobot_constructskill.study.report.answer import answer, status
-from lerobot_constructskill.study.report.findings import collect
+from lerobot_constructskill.study.report.collect import collect
 from lerobot_constructskill.study.report.wording import p_value, roman, signed
 from lerobot_constructskill.study.rows import read_rows
 from lerobot_constructskill.study.stats.comparisons import Verdict
 
 REPOSITORY = Path(__file__).parents[2]
-HOSTILE = "</style><script>alert('x')</script> | *żółć* `$\\frac$` 煉瓦 \"quoted\" & so on"
 
 SMALL = StudyPlan(
     name="small",
@@ -48,24 +45,6 @@ class Reader(HTMLParser):
 
 def findings_of(plan: StudyPlan, rows, folder: Path):
     return collect(plan, read_rows(write_study(folder, plan, rows) / "rows.parquet"))
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory) -> Path:
-    """A study with a failed run, an unfinished one, one that is missing, and two videos."""
-    root = tmp_path_factory.mktemp("study")
-    lost = {("fixed", "clip", 2), ("fixed", "clip", 8)}
-    rows = [row for row in study_rows() if (row.setting, row.variant, row.training_seed) not in lost]
-    rows.append(failed_row(PLAN, "fixed", "clip", 2, HOSTILE))
-    rows += episode_rows(PLAN, "fixed", "clip", 8, 10, 10)[:4]
-    for index, video in ((0, "videos/a & b.mp4"), (200, "videos/large.mp4"), (100, "../outside.mp4")):
-        (root / "videos").mkdir(exist_ok=True)
-        (root / video).write_bytes(b"film" if index == 0 else bytes(3 * 1024**2))
-        rows[index] = dataclasses.replace(rows[index], video=video)
-    (root / "provenance.json").write_text(json.dumps({"wall_time": "3 h", "cpu": HOSTILE}))
-    write_study(root, rows=rows)
-    report(ReportConfig(root))
-    return root
 
 
 def test_page_holds_the_papers_tables_and_every_figure(study):

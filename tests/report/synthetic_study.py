@@ -12,6 +12,9 @@ from lerobot_constructskill.study.rows import Row, write_rows
 VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
 RATES = {"fixed": 1.0, "moved": 0.25}
 
+# What a label or an error text may hold, and must not do.
+HOSTILE = "</style><script>alert('x')</script> | *żółć* `$\\frac$` 煉瓦 \"quoted\" & so on"
+
 PLAN = StudyPlan(
     name="synthetic",
     settings={

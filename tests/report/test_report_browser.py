@@ -4,9 +4,6 @@ import shutil
 import subprocess
 
 import pytest
-from synthetic_study import study_rows, write_study
-
-from lerobot_constructskill.study.report.page import write_report
 
 
 def find_chromium() -> str | None:
@@ -32,11 +29,6 @@ CUT = """[...document.querySelectorAll(".scroll")].filter(box =>
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory) -> str:
-    return write_report(write_study(tmp_path_factory.mktemp("study"), rows=study_rows())).as_uri()
-
-
-@pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as started:
@@ -47,8 +39,9 @@ def browser():
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
-def test_page(address, browser, width, scheme):
+def test_page(study, browser, width, scheme):
     page = browser.new_page(viewport={"width": width, "height": 844}, color_scheme=scheme)
+    address = (study / "report.html").as_uri()
     said, asked = [], []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
