@@ -9,11 +9,13 @@ from lerobot_constructskill.study.rollout import roll_out
 
 
 def main(folder: Path, steps: int) -> None:
-    agents = [PolicyAgent.from_pretrained(path, "cpu") for path in sorted(folder.iterdir())]
-    outcomes = roll_out(agents, {"episode_length": steps}, seeds=[1000])
-    for path, outcome in zip(sorted(folder.iterdir()), outcomes, strict=True):
-        print(path.name, *outcome.episodes, outcome.error or "")
-    print("steps:", sum(episode.steps for outcome in outcomes for episode in outcome.episodes))
+    paths = sorted(folder.iterdir())
+    agents = [PolicyAgent.from_pretrained(path, "cpu") for path in paths]
+    total = 0
+    for i, outcome in roll_out(agents, {"episode_length": steps}, seeds=[1000]):
+        print(paths[i].name, *outcome.episodes, outcome.error or "")
+        total += sum(episode.steps for episode in outcome.episodes)
+    print("steps:", total)
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a path beside `path` to write a file to; it becomes `path` when the block ends, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial = path.with_name(f".{os.getpid()}.{path.name}")  # its ending stays, for those that write by it
     try:
         yield partial
         os.replace(partial, path)

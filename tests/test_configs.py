@@ -7,14 +7,19 @@ from pathlib import Path
 
 import draccus
 import pytest
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.demos.recorder import GenerateConfig
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+from lerobot_constructskill.scripts.study import StudyConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
 DOSE = sorted((CONFIGS / "dose").glob("*.yaml"))
+STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
 
 
@@ -25,7 +30,8 @@ def generate_config(path: Path) -> GenerateConfig:
 @pytest.mark.parametrize("path", GENERATE, ids=lambda path: path.stem)
 def test_generation_configs_are_the_papers(path):
     config = generate_config(path)
-    assert (config.task, config.episodes) == ("brick_to_bin", 80)
+    assert config.task == ("brick_to_bin_shifted" if path.stem.endswith("shifted") else "brick_to_bin")
+    assert config.episodes == (2 if path.stem == "smoke" else 80)
     assert config.noise.root[0, 0] == (0.0 if path.stem.endswith("noise_free") else 0.01)
 
 
@@ -39,6 +45,26 @@ def test_a_noise_free_twin_differs_in_its_noise_alone(path):
 def test_executed_labels_differ_from_fast_in_the_labels_alone():
     fast, executed = (generate_config(CONFIGS / "generate" / f"fast{end}.yaml") for end in ("", "_executed_labels"))
     assert executed.labels == "executed" and replace(executed, labels="clean") == fast
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_a_study_names_data_sets_that_exist_and_policies_that_lerobot_knows(path):
+    plan = draccus.parse(StudyConfig, path, args=[]).plan
+    data = [s.data for s in plan.settings.values()] + [v.data for v in plan.variants.values() if v.data]
+    assert all((CONFIGS.parent / file).is_file() for file in data)
+    for setting in plan.settings.values():
+        assert ConstructSkillEnvConfig(**setting.env).task == generate_config(CONFIGS.parent / setting.data).task
+    for variant in plan.variants.values():
+        assert draccus.decode(PreTrainedConfig, variant.policy).type == variant.policy["type"]
+
+
+def test_the_papers_study_is_its_52_runs():
+    plan = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[]).plan
+    assert len(plan.runs) == 52 and plan.episodes == 10 and len(plan.pairs) == 6
+    backbones = {variant.policy["backbone"] for variant in plan.variants.values() if variant.seeds == 10}
+    assert backbones == set(BACKBONES)
+    cut = draccus.parse(StudyConfig, CONFIGS / "study" / "dense.yaml", args=["--seeds=4"]).plan
+    assert {variant.seeds for variant in cut.variants.values()} == {4} and max(cut.references.values()) == 4
 
 
 def test_the_dose_response_is_six_doses_of_fast():

@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
-from lerobot_constructskill.demos.pools import open_pool
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
+from lerobot_constructskill.pools import open_pool
 from lerobot_constructskill.staging import staged
 
 SHARDS = "shards"

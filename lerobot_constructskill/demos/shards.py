@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
 from lerobot_constructskill.contract import FPS, get_task
@@ -43,13 +44,9 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     """
     task = get_task(config.task)
     expert = make_expert(task, config.expert)
-    # A simulator of its own, for 0.3 s: PhysX keeps contacts over a reset, which shows in the next episode.
-    env = ConstructSkillEnv(config.task, config.obs_type, config.max_steps, config.light_robot)
-    try:
-        frames, success = demonstrate(env, expert, config.noise, seed, config.labels)
-        light_robot = env.light_robot
-    finally:
-        env.close()
+    env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot)
+    frames, success = demonstrate(env, expert, config.noise, seed, config.labels)
+    light_robot = env.light_robot
     outcome = Attempt(seed, success, len(frames), light_robot)
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
@@ -57,6 +54,12 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
             _write_episode(config, [frame | {"task": task.instruction} for frame in frames], shard / EPISODE)
         (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
     return outcome
+
+
+@cache
+def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | None) -> ConstructSkillEnv:
+    """This process's simulator: its episodes do not remember each other, and a new one compiles shaders for 6 s."""
+    return ConstructSkillEnv(task, obs_type, max_steps, light_robot)
 
 
 def finished(folder: Path) -> dict[int, Attempt]:

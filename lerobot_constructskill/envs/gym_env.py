@@ -150,6 +150,12 @@ class ConstructSkillEnv(gym.Env):
         """Whether the robot is drawn with decimated meshes."""
         return self._ensure_env().light_robot
 
+    @property
+    def backend(self) -> str:
+        """What simulates and what renders, such as "physx_cpu, sapien_cpu rendering"."""
+        backend = self._ensure_env().backend
+        return f"{backend.sim_backend}, {backend.render_backend} rendering"
+
     # ManiSkill
 
     def make_scene(self, num_envs: int = 1) -> gym.Env:

@@ -1,5 +1,6 @@
 """What a rollout can drive an environment with: any LeRobot policy, many of which can share one encoder."""
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,6 +71,12 @@ class PolicyAgent:
         processors = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=on_device)
         return cls(policy, *processors)
 
+    @property
+    def encoder_key(self) -> tuple:
+        """Equal for agents whose encoders are the same."""
+        config = self.policy.config
+        return config.backbone, config.backbone_sha256, config.backbone_precision, config.device
+
     def reset(self, seed: int) -> None:
         self.policy.reset()
 
@@ -89,30 +96,59 @@ class PolicyAgent:
         return image[self.policy.config.image_key].to(self.policy.config.device)
 
 
-def share_encoders(agents: Sequence[Agent]) -> None:
-    """Let agents whose encoders are the same use one object, which then encodes for all of them at once."""
-    shared: dict[tuple, FrozenEncoder] = {}
-    for agent in agents:
+class SharedEncoder:
+    """One encoder for many agents, which encodes a batch of theirs at once and a frame that it has seen only once.
+
+    With a fixed spawn a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
+
+    Args:
+        encoder: the encoder.
+        capacity: frames remembered.
+    """
+
+    def __init__(self, encoder: FrozenEncoder, capacity: int = 100_000):
+        self.encoder = encoder
+        self.capacity = capacity
+        self._seen: dict[bytes, torch.Tensor] = {}
+
+    @torch.inference_mode()
+    def __call__(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Encode (1, 3, H, W) images to (1, D) features."""
+        keys = [hashlib.sha256(image.cpu().numpy()).digest() for image in images]
+        new = {key: image for key, image in zip(keys, images, strict=True) if key not in self._seen}
+        if len(self._seen) + len(new) > self.capacity:
+            self._seen = {key: self._seen[key] for key in keys if key in self._seen}
+        self._seen |= zip(new, self._encode(list(new.values())), strict=True)
+        return [self._seen[key] for key in keys]
+
+    def _encode(self, images: list[torch.Tensor]) -> Sequence[torch.Tensor]:
+        if not images:
+            return []
+        if self.encoder.runtime == "torch" and images[0].device.type == "cpu":
+            return [self.encoder(image) for image in images]  # batches are no faster here, and round differently
+        return self.encoder(torch.cat(images)).split(1)
+
+
+def share_encoders(agents: Sequence[Agent]) -> dict[SharedEncoder, list[int]]:
+    """Give agents whose encoders are the same one object; each such encoder with the numbers of its agents."""
+    sharing: dict[tuple, list[int]] = {}
+    for i, agent in enumerate(agents):
         if agent.encoder is not None:
-            config = agent.policy.config
-            key = (config.backbone, config.backbone_sha256, config.backbone_precision, config.device)
-            agent.encoder = agent.policy.backbone = shared.setdefault(key, agent.encoder)
+            sharing.setdefault(agent.encoder_key, []).append(i)
+    for numbers in sharing.values():
+        for i in numbers:
+            agents[i].encoder = agents[i].policy.backbone = agents[numbers[0]].encoder
+    return {SharedEncoder(agents[numbers[0]].encoder): numbers for numbers in sharing.values()}
 
 
-def encode_together(agents: Sequence[Agent], observations: Mapping[int, Observation]) -> dict[int, Observation]:
-    """Give every observation its feature, one batch for each encoder: agent's number to observation."""
+def encode_together(
+    agents: Sequence[Agent], encoders: Mapping[SharedEncoder, list[int]], observations: Mapping[int, Observation]
+) -> dict[int, Observation]:
+    """Give every observation, by its agent's number, its feature: one batch for each encoder."""
     encoded = dict(observations)
-    for encoder in {id(a.encoder): a.encoder for a in agents if a.encoder is not None}.values():
-        numbers = [i for i in observations if agents[i].encoder is encoder]
-        images = [agents[i].image(observations[i]) for i in numbers]
-        for i, feature in zip(numbers, _encode(encoder, images), strict=True):
+    for encoder, sharing in encoders.items():
+        numbers = [i for i in sharing if i in observations]
+        features = encoder([agents[i].image(observations[i]) for i in numbers])
+        for i, feature in zip(numbers, features, strict=True):
             encoded[i] = replace(observations[i], feature=feature)
     return encoded
-
-
-@torch.inference_mode()
-def _encode(encoder: FrozenEncoder, images: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-    """Encode (1, 3, H, W) images to (1, D) features, together where that is faster and gives the same."""
-    if encoder.runtime == "torch" and images and images[0].device.type == "cpu":
-        return [encoder(image) for image in images]  # batches are no faster here, and round differently
-    return encoder(torch.cat(images)).split(1) if images else []

@@ -69,11 +69,12 @@ class Training:
 
 @dataclass(frozen=True)
 class Run:
-    """One training seed of one variant in one setting: the unit of evidence."""
+    """One training seed of one variant in one setting, the unit of evidence; or one of a reference."""
 
     setting: str
     variant: str
     seed: int
+    is_reference: bool = False
 
     @property
     def id(self) -> str:
@@ -88,7 +89,7 @@ class StudyPlan:
         name: what the study is called.
         settings: name to setting.
         variants: name to variant.
-        references: floors and ceilings to run in every setting, some of `REFERENCES`.
+        references: floors and ceilings to run in every setting, some of `REFERENCES`, to the number of their seeds.
         training: the recipe.
         episodes: evaluation episodes of a run.
         eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
@@ -103,7 +104,7 @@ class StudyPlan:
     name: str
     settings: dict[str, Setting]
     variants: dict[str, Variant]
-    references: list[str] = field(default_factory=list)
+    references: dict[str, int] = field(default_factory=dict)
     training: Training = field(default_factory=Training)
     episodes: int = 10
     eval_seed: int = 1000
@@ -114,12 +115,16 @@ class StudyPlan:
         for name in (self.name, *self.settings, *self.variants):
             if not NAME.fullmatch(name):
                 raise ValueError(f"'{name}' is no name for a study, setting or variant; use a-z, 0-9, '_' and '-'.")
+        if taken := [name for name in self.variants if name in REFERENCES]:
+            raise ValueError(f"'{taken[0]}' is the name of a reference; call the variant something else.")
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
                 raise ValueError(f"A study needs at least one of {kind}.")
-        _check_known("reference", self.references, REFERENCES)
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1, not {self.episodes}.")
+        _check_known("reference", list(self.references), REFERENCES)
+        counts = {"episodes": self.episodes, **self.references}
+        for name, count in counts.items():
+            if count < 1:
+                raise ValueError(f"{name} must be at least 1, not {count}.")
         if not 0 < self.alpha < 1:
             raise ValueError(f"alpha must lie between 0 and 1, not {self.alpha}.")
         for setting in self.settings.values():
@@ -137,7 +142,7 @@ class StudyPlan:
 
     @property
     def runs(self) -> list[Run]:
-        """Every run, setting by setting and variant by variant."""
+        """Every run of a variant, setting by setting and variant by variant."""
         return [
             Run(setting, name, seed)
             for setting in self.settings
@@ -145,6 +150,29 @@ class StudyPlan:
             if setting in (variant.settings or self.settings)
             for seed in range(variant.seeds)
         ]
+
+    @property
+    def reference_runs(self) -> list[Run]:
+        """Every run of a floor or ceiling."""
+        return [
+            Run(setting, name, seed, is_reference=True)
+            for setting in self.settings
+            for name, seeds in self.references.items()
+            for seed in range(seeds)
+        ]
+
+    def variant_of(self, run: Run) -> Variant:
+        """What a run trains; `blind` and `untrained` are the first frozen_vit variant, with other eyes.
+
+        Raises:
+            ValueError: the plan has no frozen_vit variant for them.
+        """
+        if not run.is_reference:
+            return self.variants[run.variant]
+        for variant in self.variants.values():
+            if variant.policy["type"] == "frozen_vit":
+                return variant
+        raise ValueError(f"The reference '{run.variant}' needs a variant of type frozen_vit to be made from.")
 
     @property
     def pairs(self) -> list[tuple[str, str]]:

@@ -1,6 +1,6 @@
 """Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -43,10 +43,11 @@ class Episode:
 
 @dataclass
 class Outcome:
-    """What became of one agent: its finished episodes, and why it stopped if it failed."""
+    """What became of one agent: its episodes, or why it failed."""
 
     episodes: list[Episode] = field(default_factory=list)
     error: Exception | None = None
+    backend: str | None = None
 
 
 def roll_out(
@@ -55,7 +56,7 @@ def roll_out(
     seeds: Sequence[int],
     n_workers: int | None = None,
     on_step: OnStep | None = None,
-) -> list[Outcome]:
+) -> Iterator[tuple[int, Outcome]]:
     """Run every agent through one episode per seed, in `ConstructSkillEnv(**env_kwargs)`.
 
     An agent's episodes are those of `lerobot-eval` with the same seeds and one environment, step for step. An agent
@@ -64,17 +65,21 @@ def roll_out(
     Args:
         n_workers: simulator processes; one per core by default.
 
+    Yields:
+        An agent's number and its outcome, as soon as it has finished or failed.
+
     Raises:
         RuntimeError: a simulator's process died.
     """
-    share_encoders(agents)
-    with simulators(len(agents), env_kwargs, n_workers) as sims, tqdm(unit="step", desc="rollout") as progress:
-        lanes = _Lanes(agents, get_task(env_kwargs.get("task", "brick_to_bin")).instruction, sims, seeds, on_step)
+    instruction = get_task(env_kwargs.get("task", "brick_to_bin")).instruction
+    with simulators(len(agents), env_kwargs, n_workers) as sims, tqdm(unit="step", desc="rollout", leave=False) as bar:
+        lanes = _Lanes(agents, instruction, sims, seeds, on_step)
         while lanes.current:
-            progress.update(len(lanes.current))
-            progress.set_postfix(running=len(lanes.current))
+            bar.update(len(lanes.current))
+            bar.set_postfix(running=len(lanes.current), refresh=False)
             lanes.advance()
-    return lanes.outcomes
+            yield from lanes.settled()
+        yield from lanes.settled()
 
 
 class _Lanes:
@@ -83,14 +88,16 @@ class _Lanes:
     def __init__(self, agents, instruction: str, sims: Simulators, seeds: Sequence[int], on_step: OnStep | None):
         self.agents, self.sims, self.seeds, self.on_step = agents, sims, seeds, on_step
         self.instruction = instruction
+        self.encoders = share_encoders(agents)
         self.outcomes = [Outcome() for _ in agents]
         self.current: dict[int, Step] = {}
+        self._reported: set[int] = set()
         self._start(range(len(agents)))
 
     def advance(self) -> None:
         """One step of every agent that still runs."""
         seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in self.current.items()}
-        seen = encode_together(self.agents, seen)
+        seen = encode_together(self.agents, self.encoders, seen)
         actions = self._settle({i: _attempt(self.agents[i].act, observation) for i, observation in seen.items()})
         self.current = self._settle(self.sims.step(actions))
         for i, step in self.current.items():
@@ -101,6 +108,14 @@ class _Lanes:
         for i in finished:
             del self.current[i]
         self._start([i for i in finished if len(self.outcomes[i].episodes) < len(self.seeds)])
+
+    def settled(self) -> Iterator[tuple[int, Outcome]]:
+        """The agents that have stopped since this was last asked."""
+        for i in set(range(len(self.agents))) - self.current.keys() - self._reported:
+            self._reported.add(i)
+            if self.outcomes[i].error is None:
+                self.outcomes[i].backend = self.sims.backend(i)
+            yield i, self.outcomes[i]
 
     def _start(self, numbers: Sequence[int]) -> None:
         """Begin the next episode of these agents."""
@@ -114,8 +129,7 @@ class _Lanes:
         """Take out the agents whose result is an exception: they have failed."""
         for i, result in results.items():
             if isinstance(result, Exception):
-                self.outcomes[i].error = result
-                self.outcomes[i].episodes.pop()
+                self.outcomes[i] = Outcome(error=result)
         return {i: result for i, result in results.items() if not isinstance(result, Exception)}
 
 

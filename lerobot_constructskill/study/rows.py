@@ -90,11 +90,22 @@ def read_rows(*paths: Path) -> pd.DataFrame:
     Raises:
         ValueError: a file does not hold rows of a study.
     """
-    tables = [pq.read_table(path) for path in paths]
-    for path, table in zip(paths, tables, strict=True):
-        if not table.schema.equals(SCHEMA):
+    return _read_tables(paths).to_pandas(types_mapper=_nullable)
+
+
+def merge_rows(paths: Iterable[Path], merged: Path) -> None:
+    """Write the rows of `paths`, in their order, to one file, which appears whole or not at all."""
+    with replaced(merged) as partial:
+        pq.write_table(_read_tables(paths), partial)
+
+
+def _read_tables(paths: Iterable[Path]) -> pa.Table:
+    tables = [SCHEMA.empty_table()]
+    for path in paths:
+        tables.append(pq.read_table(path))
+        if not tables[-1].schema.equals(SCHEMA):
             raise ValueError(f"'{path}' is not a table of study rows of this version.")
-    return pa.concat_tables(tables or [SCHEMA.empty_table()]).to_pandas(types_mapper=_nullable)
+    return pa.concat_tables(tables)
 
 
 def _nullable(kind: pa.DataType):

@@ -44,9 +44,9 @@ class Simulators:
         """Advance each named environment: number to action."""
         return self._ask("step", actions)
 
-    def render(self, numbers: Sequence[int]) -> dict[int, np.ndarray]:
-        """A close-up of each named environment, (H, W, 3) uint8."""
-        return self._ask("render", dict.fromkeys(numbers))
+    def backend(self, number: int) -> str:
+        """What simulates and renders an environment that has been reset."""
+        return self._ask("backend", {number: None})[number]
 
     def _ask(self, verb: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
         shares = [{} for _ in self._workers]
@@ -126,7 +126,7 @@ def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
     return Step(seen, env.privileged_state(), terminated or truncated, info)
 
 
-_VERBS = {"reset": _reset, "step": _step, "render": lambda env, _: env.render()}
+_VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}
 
 
 def _attempt(verb: str, env: ConstructSkillEnv, argument: Any) -> Any:

@@ -1,0 +1,127 @@
+"""The checkpoints of a study: what is trained for a job, once, as ordinary LeRobot policies."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.staging import staged
+from lerobot_constructskill.study.plan import Run, StudyPlan, Training
+from lerobot_constructskill.study.prepare import Store
+from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+
+TRAINED = ("blind", "untrained")
+"""References that train a policy."""
+
+HELDOUT_FILE = "training.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """Runs of one variant, or of one reference, in one setting; they differ in their seeds alone.
+
+    Args:
+        plan: the study.
+        runs: its runs.
+        root: the study's folder.
+        store: where data sets are.
+    """
+
+    plan: StudyPlan
+    runs: tuple[Run, ...]
+    root: Path
+    store: Store
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Fields of the environment."""
+        return self.plan.settings[self.runs[0].setting].env
+
+    @property
+    def data(self) -> str:
+        """The `constructskill-generate` configuration of its demonstrations."""
+        run = self.runs[0]
+        own = None if run.is_reference else self.plan.variants[run.variant].data
+        return own or self.plan.settings[run.setting].data
+
+    def folder(self, run: Run) -> Path:
+        return self.root / "runs" / run.id
+
+    def checkpoint(self, run: Run) -> Path:
+        return self.folder(run) / "pretrained_model"
+
+
+def demonstrations(job: Job) -> LeRobotDataset:
+    return job.store.demonstrations(job.data)
+
+
+def heldout_error(job: Job, run: Run) -> float | None:
+    """The run's translation error on held-out demonstrations in m2, None where there is none."""
+    file = job.folder(run) / HELDOUT_FILE
+    return json.loads(file.read_text())["heldout_mse_m2"] if file.exists() else None
+
+
+def train(job: Job) -> None:
+    """Train the runs of a job that have no checkpoint yet; each appears whole or not at all."""
+    missing = [run for run in job.runs if not job.folder(run).exists()]
+    if not missing:
+        return
+    variant = job.plan.variant_of(missing[0])
+    training = replace(job.plan.training, **variant.training)
+    if variant.policy["type"] == "frozen_vit":
+        _train_together(job, missing, dict(variant.policy), training)
+    else:
+        for run in missing:
+            _train_stock(job, run, variant.policy, training)
+
+
+def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training: Training) -> None:
+    reference = runs[0].variant if runs[0].is_reference else None
+    if reference == "untrained":
+        policy["backbone_path"] = str(job.store.untrained_weights(policy.get("backbone", "dinov2_vits14")))
+    features = job.store.features(demonstrations(job), policy, blind=reference == "blind")
+    fields = {name: value for name, value in policy.items() if name != "type"}
+    config = draccus.decode(FrozenViTChunkConfig, fields | {"save_backbone": False, "push_to_hub": False})
+    trained = train_seeds(config, features, [run.seed for run in runs], training)
+    for run, one in zip(runs, trained, strict=True):
+        with staged(job.folder(run)) as folder:
+            save_checkpoint(one.policy, features, folder / job.checkpoint(run).name)
+            (folder / HELDOUT_FILE).write_text(json.dumps({"heldout_mse_m2": one.heldout_mse_m2}))
+
+
+def _train_stock(job: Job, run: Run, policy: dict[str, Any], training: Training) -> None:
+    """Train any other policy type with lerobot-train, for as many passes over the same demonstrations."""
+    dataset = demonstrations(job)
+    kept = [i for i in range(dataset.num_episodes) if i % training.holdout != training.holdout - 1]
+    frames = sum(dataset.meta.episodes["length"][i] for i in kept)
+    steps = training.epochs * -(-frames // training.batch_size)
+    with staged(job.folder(run)) as folder:
+        command = [
+            str(Path(sys.executable).parent / "lerobot-train"),
+            f"--dataset.repo_id={dataset.repo_id}",
+            f"--dataset.root={dataset.root}",
+            f"--dataset.episodes={kept}",
+            *(f"--policy.{name}={_flag(value)}" for name, value in policy.items()),
+            "--policy.push_to_hub=false",
+            f"--batch_size={training.batch_size}",
+            f"--steps={steps}",
+            f"--save_freq={steps}",
+            "--env_eval_freq=0",
+            f"--seed={run.seed}",
+            f"--output_dir={folder}",
+        ]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"lerobot-train failed: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+        last = (folder / "checkpoints" / "last" / "pretrained_model").resolve()
+        last.rename(folder / job.checkpoint(run).name)
+
+
+def _flag(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)

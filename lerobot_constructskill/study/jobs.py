@@ -1,0 +1,83 @@
+"""One piece of a study: some seeds of one variant in one setting, trained and evaluated."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import version
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.study.agents import Agent, PolicyAgent
+from lerobot_constructskill.study.checkpoints import TRAINED, Job, demonstrations, heldout_error, train
+from lerobot_constructskill.study.film import Film
+from lerobot_constructskill.study.plan import Run
+from lerobot_constructskill.study.references import Blind, Expert, NoOp, Random, Replay
+from lerobot_constructskill.study.rollout import Outcome, roll_out
+from lerobot_constructskill.study.rows import Row
+
+PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "transformers", "numpy")
+
+
+def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
+    """Train what is not trained yet, evaluate it, and yield each run's rows as soon as it has them.
+
+    A run that fails yields one row that says why.
+    """
+    try:
+        agents = _agents(job)
+    except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
+        yield from ((run, [_failed(job, run, error)]) for run in job.runs)
+        return
+    seeds = range(job.plan.eval_seed, job.plan.eval_seed + job.plan.episodes)
+    film = Film()
+    for i, outcome in roll_out(agents, job.env, seeds, on_step=film.add):
+        run = job.runs[i]
+        video = film.write(job.root, run)
+        yield run, _finished(job, run, outcome, video) if outcome.error is None else [_failed(job, run, outcome.error)]
+
+
+def _agents(job: Job) -> list[Agent]:
+    name = job.runs[0].variant
+    if not job.runs[0].is_reference or name in TRAINED:
+        train(job)
+        kind = Blind if name == "blind" else PolicyAgent
+        return [kind.from_pretrained(job.checkpoint(run)) for run in job.runs]
+    task = get_task(job.env.get("task", "brick_to_bin"))
+    if name == "replay":
+        return [Replay(task, demonstrations(job), run.seed) for run in job.runs]
+    if name == "random":
+        return [Random(task, run.seed) for run in job.runs]
+    return [{"no_op": NoOp, "expert": Expert}[name](task) for _ in job.runs]
+
+
+def _finished(job: Job, run: Run, outcome: Outcome, video: str | None) -> list[Row]:
+    common = _row(job, run, outcome.backend)
+    return [
+        replace(common, **vars(episode), episode=i, video=video if i == 0 else None)
+        for i, episode in enumerate(outcome.episodes)
+    ]
+
+
+def _failed(job: Job, run: Run, error: Exception) -> Row:
+    return replace(_row(job, run), error=" ".join(f"{type(error).__name__}: {error}".split()))
+
+
+def _row(job: Job, run: Run, backend: str | None = None) -> Row:
+    """What every row of a run says."""
+    model = job.checkpoint(run) / "model.safetensors"
+    environment = json.dumps({**job.env, "backend": backend}, sort_keys=True)
+    return Row(
+        plan_sha256=job.plan.sha256,
+        setting=run.setting,
+        variant=run.variant,
+        is_reference=run.is_reference,
+        training_seed=run.seed,
+        evaluation_seed=job.plan.eval_seed,
+        episode=0,
+        heldout_mse_m2=heldout_error(job, run),
+        dataset_sha256=job.store.dataset_sha256(job.data),
+        weights_sha256=hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else None,
+        environment_sha256=hashlib.sha256(environment.encode()).hexdigest(),
+        backend=backend,
+        versions=json.dumps({name: version(name) for name in PACKAGES}),
+    )

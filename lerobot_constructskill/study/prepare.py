@@ -1,0 +1,109 @@
+"""What a study stands on, made once and found again: demonstrations, and their features under every encoder."""
+
+import hashlib
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDataset
+from safetensors.torch import save_file
+
+from lerobot_constructskill.demos.recorder import record
+from lerobot_constructskill.demos.settings import GenerateConfig, provenance
+from lerobot_constructskill.features.encode import data_sha256, encode_frames, load_encoder, write_feature_set
+from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
+from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.staging import replaced, staged
+
+ENCODE_BATCH = 16
+GREY = 0.5
+"""What a blind policy sees, in every pixel."""
+
+
+class Store:
+    """A folder of data sets, each under the hash of what it was made from, so that studies can share them.
+
+    Args:
+        root: the folder.
+        workers: processes that generate demonstrations.
+    """
+
+    def __init__(self, root: Path, workers: int = 1):
+        self.root = root
+        self.workers = workers
+
+    def demonstrations(self, config_file: str) -> LeRobotDataset:
+        """The data set of a `constructskill-generate` configuration.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it is not such a configuration, or too many attempts failed.
+        """
+        config, root = self._demonstrations_of(config_file)
+        if not root.exists():
+            record(replace(config, root=str(root), workers=self.workers))
+        return LeRobotDataset(config.repo_id, root=root)
+
+    def dataset_sha256(self, config_file: str) -> str | None:
+        """Hash of the frames and videos of a configuration's data set, None while it has not been made."""
+        try:
+            _, root = self._demonstrations_of(config_file)
+        except (OSError, ValueError):
+            return None
+        return _cached_sha256(root) if root.exists() else None
+
+    def _demonstrations_of(self, config_file: str) -> tuple[GenerateConfig, Path]:
+        if not Path(config_file).is_file():
+            raise FileNotFoundError(f"There is no constructskill-generate configuration '{config_file}'.")
+        name = Path(config_file).stem
+        config = draccus.parse(GenerateConfig, config_path=config_file, args=[f"--repo_id=local/{name}"])
+        return config, self.root / f"{name}-{_digest(provenance(config))}"
+
+    def features(self, demonstrations: LeRobotDataset, policy: dict[str, Any], blind: bool = False) -> LeRobotDataset:
+        """The features of demonstrations under a `frozen_vit` policy's encoder; of a grey image if it is `blind`.
+
+        Raises:
+            FileNotFoundError: no source has the encoder's weights.
+        """
+        camera = policy.get("camera", "base")
+        encoder, info = load_encoder(
+            policy.get("backbone", "dinov2_vits14"),
+            policy.get("backbone_path"),
+            policy.get("backbone_precision", "float32"),
+        )
+        made_of = {**info, "camera": camera, "blind": blind}
+        root = self.root / f"{demonstrations.root.name}-features-{_digest(made_of)}"
+        repo_id = f"{demonstrations.repo_id}_{info['backbone']}"
+        if not root.exists():
+            with staged(root) as folder:
+                encode = _encode_grey if blind else encode_frames
+                features = encode(demonstrations, camera, encoder, ENCODE_BATCH)
+                write_feature_set(demonstrations, camera, features, info, repo_id, folder)
+        return LeRobotDataset(repo_id, root=root)
+
+    def untrained_weights(self, backbone: str) -> Path:
+        """Random weights of a backbone's architecture: what is its pretraining worth?"""
+        path = self.root / f"untrained-{backbone}.safetensors"
+        if not path.exists():
+            with torch.random.fork_rng(devices=[]), replaced(path) as partial:
+                torch.manual_seed(0)
+                save_file(get_backbone(backbone).build().state_dict(), partial)
+        return path
+
+
+def _encode_grey(demonstrations: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int) -> np.ndarray:
+    feature = encoder(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY))
+    return feature.expand(demonstrations.num_frames, -1).numpy().copy()
+
+
+_cached_sha256 = cache(data_sha256)
+"""A finished data set does not change."""
+
+
+def _digest(facts: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:8]
