@@ -1,18 +1,22 @@
-"""How encoding and training together grow with the number of demonstrations: seconds per frame and peak memory.
+"""How each stage grows with the number of demonstrations: seconds for each further one, and peak memory.
 
-The demonstrations are short and of random colours, and the encoder is the small one with random weights: what is
-measured is how the cost grows, not what it is.
+Generation is measured on real demonstrations, few of them. Merging, encoding and training are measured on up to 1280:
+copies of one for merging, and short ones of random colours for encoding, with the small encoder and random weights.
+What is measured is how the cost grows, not what it is.
 """
+
+import shutil
 
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
-from measure import OUT, report, run
+from measure import OUT, Ran, report, run
 from safetensors.torch import save_file
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 
-DEMONSTRATIONS, LENGTH, SHAPE = (80, 320, 1280), 20, (224, 224, 3)
+GENERATED, DEMONSTRATIONS = (4, 12, 36), (80, 320, 1280)
+LENGTH, SHAPE = 20, (224, 224, 3)
 WEIGHTS = OUT / "vit_tiny16.safetensors"
 
 
@@ -36,11 +40,20 @@ def write_demonstrations(root, count: int) -> None:
     dataset.finalize()
 
 
-def measured(count: int) -> dict[str, tuple[float, float]]:
-    """Stage to seconds and peak megabytes, for `count` demonstrations."""
+def generation(count: int) -> Ran:
+    out = OUT / "scaling" / f"generated_{count}"
+    config = ["--config_path=configs/generate/fast.yaml", f"--episodes={count}", "--workers=2"]
+    return run("constructskill-generate", *config, "--repo_id=local/some", f"--root={out}")
+
+
+def merging(count: int) -> Ran:
+    return run("python", "benchmarks/merge_many.py", str(OUT / "scaling" / f"merged_{count}"), str(count))
+
+
+def encoding(count: int) -> Ran:
     root = OUT / "scaling" / str(count)
     write_demonstrations(root / "demonstrations", count)
-    encode = run(
+    return run(
         "constructskill-encode",
         "--repo_id=local/many",
         f"--root={root}/demonstrations",
@@ -49,22 +62,28 @@ def measured(count: int) -> dict[str, tuple[float, float]]:
         "--backbone=vit_tiny16",
         f"--backbone_path={WEIGHTS}",
     )
-    train = run("python", "benchmarks/ten_seeds.py", str(root), "10", "256", str(WEIGHTS))
-    return {"encoding": encode, "training ten seeds together": train}
+
+
+def training(count: int) -> Ran:
+    return run("python", "benchmarks/ten_seeds.py", str(OUT / "scaling" / str(count)), "10", "256", str(WEIGHTS))
+
+
+STAGES = {generation: GENERATED, merging: DEMONSTRATIONS, encoding: DEMONSTRATIONS, training: DEMONSTRATIONS}
 
 
 def main() -> None:
     torch.manual_seed(0)
+    shutil.rmtree(OUT / "scaling", ignore_errors=True)
     save_file(BACKBONES["vit_tiny16"].build().state_dict(), WEIGHTS)
-    few, some, many = (measured(count) for count in DEMONSTRATIONS)
-    for stage in few:
-        frames = LENGTH * (DEMONSTRATIONS[2] - DEMONSTRATIONS[1])
-        early = (some[stage].seconds - few[stage].seconds) / (LENGTH * (DEMONSTRATIONS[1] - DEMONSTRATIONS[0]))
-        late = (many[stage].seconds - some[stage].seconds) / frames
-        note = f"of each further demonstration, {DEMONSTRATIONS[1]} to {DEMONSTRATIONS[2]} against the first ones"
-        report(f"{stage}, ms a frame", 1e3 * late, "at 80 to 320", 1e3 * early, note=note, less_is_better=True)
-        peaks = few[stage].peak_mb, many[stage].peak_mb
-        report(f"{stage}, peak memory in MB, 1280 demonstrations", peaks[1], "80", peaks[0], less_is_better=True)
+    for stage, counts in STAGES.items():
+        few, some, many = (stage(count) for count in counts)
+        early = (some.seconds - few.seconds) / (counts[1] - counts[0])
+        late = (many.seconds - some.seconds) / (counts[2] - counts[1])
+        name, steps = stage.__name__, f"{counts[1]} to {counts[2]}"
+        what = f"{name}, ms for each further demonstration, {steps}"
+        report(what, 1e3 * late, f"{counts[0]} to {counts[1]}", 1e3 * early, less_is_better=True)
+        what = f"{name}, peak memory in MB, {counts[2]} demonstrations"
+        report(what, many.peak_mb, f"{counts[0]} demonstrations", few.peak_mb, less_is_better=True)
 
 
 if __name__ == "__main__":

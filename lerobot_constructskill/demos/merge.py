@@ -1,6 +1,8 @@
 """Shards into one LeRobotDataset by LeRobot's own aggregation, in the order of their seeds, the same bytes always."""
 
 import json
+import tempfile
+from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,9 @@ from lerobot_constructskill.demos.modality import MODALITY, modality
 from lerobot_constructskill.demos.settings import GenerateConfig, package_versions, provenance
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
 
+GROUP = 32
+"""Data sets that are aggregated at a time."""
+
 
 def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder: Path) -> None:
     """Write the data set of `attempts`, which are in the order of their seeds, to `folder`.
@@ -20,15 +25,14 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     Raises:
         ValueError: the attempts were drawn in different ways, on machines that are not alike.
     """
-    from lerobot.datasets.aggregate import aggregate_datasets
-
     if len({attempt.light_robot for attempt in attempts}) > 1:
         raise ValueError(
             "Some attempts drew the light robot and some the full one, on machines with and without a GPU: "
             "set --light_robot and generate anew."
         )
     roots = [shards / str(attempt.seed) / EPISODE for attempt in attempts if attempt.success]
-    aggregate_datasets([config.repo_id] * len(roots), config.repo_id, roots, folder)
+    with tempfile.TemporaryDirectory(dir=shards) as scratch:
+        _aggregate(config.repo_id, roots, folder, Path(scratch))
     _write_statistics(folder)
     task = get_task(config.task)
     (folder / MODALITY).write_text(json.dumps(modality(task, config.obs_type), indent=2) + "\n")
@@ -41,6 +45,19 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         "sha256": file_hashes(folder),
     }
     (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n")
+
+
+def _aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
+    """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    while len(roots) > GROUP:
+        groups = list(batched(roots, GROUP))
+        scratch = scratch / "groups"
+        roots = [scratch / str(number) for number in range(len(groups))]
+        for group, root in zip(groups, roots, strict=True):
+            aggregate_datasets([repo_id] * len(group), repo_id, list(group), root)
+    aggregate_datasets([repo_id] * len(roots), repo_id, roots, folder)
 
 
 def _write_statistics(folder: Path) -> None:

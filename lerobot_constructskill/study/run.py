@@ -56,9 +56,10 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
         with tqdm(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
             for run, rows in _execute(_jobs(plan, root, store, runs, finished, options.together), options):
                 write_rows(rows, _row_file(root, run))
-                merge_rows(filter(Path.exists, (_row_file(root, run) for run in runs)), root / ROWS)
+                _merge(root, runs)
                 progress.update()
                 progress.set_postfix_str(run.id)
+        _merge(root, runs)
         return read_rows(root / ROWS)
 
 
@@ -116,3 +117,8 @@ def _row_file(root: Path, run: Run) -> Path:
 def _is_finished(root: Path, run: Run, options: Options) -> bool:
     path = _row_file(root, run)
     return path.exists() and not (options.retry_failed and read_rows(path)["error"].notna().any())
+
+
+def _merge(root: Path, runs: list[Run]) -> None:
+    """Put the rows there are into the study's table, in the plan's order."""
+    merge_rows(filter(Path.exists, (_row_file(root, run) for run in runs)), root / ROWS)

@@ -3,19 +3,14 @@
 import shutil
 
 import pytest
-from toy import ToyEnv
-
-from lerobot_constructskill.demos import shards
-from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from toy import record_toy
 
 
 @pytest.fixture(scope="session")
 def pristine(tmp_path_factory):
     """Root of the toy data set; not to be written to."""
     root = tmp_path_factory.mktemp("toy") / "set"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shards, "ConstructSkillEnv", ToyEnv)
-        record(GenerateConfig("local/toy", str(root), episodes=9))
+    record_toy(root, episodes=9)
     return root
 
 

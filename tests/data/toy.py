@@ -4,8 +4,11 @@ The experts, the noise, the recorder and the video encoder are the real ones.
 """
 
 import numpy as np
+import pytest
 
 from lerobot_constructskill.contract import IMAGE_SIZE, OBS_TYPES, REWARD_LIFTED, REWARD_PLACED
+from lerobot_constructskill.demos import shards
+from lerobot_constructskill.demos.recorder import GenerateConfig, record
 
 RESPONSE = 0.3
 """Metres moved for a metre asked for, about what the simulated arm does."""
@@ -70,3 +73,10 @@ class ToyEnv:
             u, v = (np.array([place[1] + 0.5, 0.7 - place[2]]) * 200).astype(int).clip(8, IMAGE_SIZE - 8)
             image[v - 8 : v + 8, u - 8 : u + 8] = colour
         return {"pixels": dict.fromkeys(self.cameras, image)}
+
+
+def record_toy(root, episodes):
+    """Record with the toy in place of this process's simulator."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "_environment", ToyEnv)
+        record(GenerateConfig("local/toy", str(root), episodes=episodes))
