@@ -26,7 +26,10 @@ TRANSLATION = ("dx", "dy", "dz")
 """End-effector displacement asked for in one step, in metres, in the robot's base frame."""
 
 ROTATION = ("droll", "dpitch", "dyaw")
-"""End-effector rotation asked for in one step, in radians."""
+"""End-effector rotation asked for in one step, in radians, about the axes of the robot's base (right-handed)."""
+
+ROTATION_SIGN = -1
+"""ManiSkill's `pd_ee_delta_pose` takes rotations the other way round: it scales them by its lower bound."""
 
 GRIPPER = "gripper"
 """Last action channel: +1 open, -1 closed."""
@@ -99,6 +102,8 @@ class Task:
         scene: `module:class` of the ManiSkill environment.
         expert: `module:class` of the scripted expert.
         action_names: channels of `action`, translations (and rotations) first, the gripper last.
+        noisy_yield: share of demonstrations under the default noise that succeed at least; the others are discarded,
+            and a data set of a task below 0.5 needs a larger `max_failures`.
     """
 
     name: str
@@ -108,7 +113,16 @@ class Task:
     scene: str
     expert: str
     action_names: tuple[str, ...] = (*TRANSLATION, GRIPPER)
+    noisy_yield: float = 0.9
 
+
+_PICK_PLACE = "lerobot_constructskill.demos.pick_place:PickPlaceExpert"
+_PRECISE = "lerobot_constructskill.demos.precise:PreciseExpert"
+_TURNING = "lerobot_constructskill.demos.precise:TurningExpert"
+_SCENES = "lerobot_constructskill.sim.tasks"
+
+LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}
+"""The tolerance ladder: task name to the total clearance in x and in y, in metres."""
 
 TASKS = {
     task.name: task
@@ -118,24 +132,69 @@ TASKS = {
             env_id="ConstructionPickPlace-ViT-v1",
             instruction="Pick up the brick and place it in the bin.",
             horizon=700,
-            scene="lerobot_constructskill.sim.tasks.brick:BrickToBinEnv",
-            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+            scene=f"{_SCENES}.brick:BrickToBinEnv",
+            expert=_PICK_PLACE,
         ),
         Task(
             name="brick_to_bin_shifted",
             env_id="ConstructionPickPlaceShifted-v1",
             instruction="Pick up the brick and place it in the bin.",
             horizon=700,
-            scene="lerobot_constructskill.sim.tasks.brick_shifted:BrickToBinShiftedEnv",
-            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+            scene=f"{_SCENES}.brick_shifted:BrickToBinShiftedEnv",
+            expert=_PICK_PLACE,
         ),
         Task(
             name="block_to_bin",
             env_id="ConstructionBlockPickPlace-v1",
             instruction="Pick up the concrete block and place it in the bin.",
             horizon=700,
-            scene="lerobot_constructskill.sim.tasks.block:BlockToBinEnv",
-            expert="lerobot_constructskill.demos.pick_place:PickPlaceExpert",
+            scene=f"{_SCENES}.block:BlockToBinEnv",
+            expert=_PICK_PLACE,
+        ),
+        *(
+            Task(
+                name=name,
+                env_id=f"ConstructionBrickLadder{clearance * 1000:.0f}mm-v1",
+                instruction="Pick up the brick and set it down in the close-fitting bin.",
+                horizon=400,
+                scene=f"{_SCENES}.ladder:BrickLadderEnv",
+                expert=_PRECISE,
+                noisy_yield=0.9 if clearance >= 0.01 else 0.3,
+            )
+            for name, clearance in LADDER.items()
+        ),
+        Task(
+            name="brick_to_bin_turned",
+            env_id="ConstructionPickPlaceTurned-v1",
+            instruction="Turn the gripper to the brick, pick it up and place it in the bin.",
+            horizon=500,
+            scene=f"{_SCENES}.brick_turned:BrickToBinTurnedEnv",
+            expert=_TURNING,
+            action_names=(*TRANSLATION, "dyaw", GRIPPER),
+        ),
+        Task(
+            name="brick_on_brick",
+            env_id="ConstructionBrickOnBrick-v1",
+            instruction="Pick up the brick and set it flush on top of the other brick.",
+            horizon=400,
+            scene=f"{_SCENES}.brick_on_brick:BrickOnBrickEnv",
+            expert=_PRECISE,
+        ),
+        Task(
+            name="tile_to_grid",
+            env_id="ConstructionTileToGrid-v1",
+            instruction="Take the ceiling tile by its lifter and lay it into the opening of the grid.",
+            horizon=400,
+            scene=f"{_SCENES}.tile:TileToGridEnv",
+            expert=_PRECISE,
+        ),
+        Task(
+            name="tenon_to_mortise",
+            env_id="ConstructionTenonToMortise-v1",
+            instruction="Pick up the timber post and set its tenon into the mortise of the sill.",
+            horizon=400,
+            scene=f"{_SCENES}.tenon:TenonToMortiseEnv",
+            expert=_PRECISE,
         ),
     )
 }

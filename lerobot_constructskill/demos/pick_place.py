@@ -44,10 +44,16 @@ class PickPlaceExpert:
                 break
             progress = Progress(PHASES[following], 0, state.tcp)
         phase = progress.phase
-        action = np.array([*self._translation(state, progress), GRIPPER[phase]], dtype=np.float32)
+        action = self._action(state, progress).astype(np.float32)
         after = progress.step()
-        is_last = phase is PHASES[-1] and after.steps >= self.config.release_dwell
-        return action, phase, None if is_last else after
+        return action, phase, None if self._is_last(state, after) else after
+
+    def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
+        """Whether the demonstration is over with the action that led to `after`."""
+        return after.phase is PHASES[-1] and after.steps >= self.config.release_dwell
+
+    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        return np.array([*self._translation(state, progress), GRIPPER[progress.phase]])
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
         if progress.phase is Phase.GRASP:
@@ -62,8 +68,11 @@ class PickPlaceExpert:
         error = self._waypoint(state, progress) - state.tcp
         if progress.phase not in (Phase.LIFT, Phase.CARRY):
             return self._toward(error, self.config.max_step)
+        return self._toward(error, self.config.load_max_step) + self._weight_compensation(state)
+
+    def _weight_compensation(self, state: PrivilegedState) -> np.ndarray:
         weight = GRAVITY * state.object_mass[0]
-        return self._toward(error, self.config.load_max_step) + [0, 0, self.config.compliance * weight]
+        return np.array([0, 0, self.config.compliance * weight])
 
     def _toward(self, error: np.ndarray, longest: float) -> np.ndarray:
         return np.clip(self.config.gain * error, -longest, longest)

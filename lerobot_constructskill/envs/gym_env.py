@@ -1,4 +1,4 @@
-"""One brick-task environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
+"""One environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
 
 from typing import Any
 
@@ -15,25 +15,34 @@ from lerobot_constructskill.contract import (
     IMAGE_SIZE,
     OBS_TYPES,
     ROTATION,
+    ROTATION_SIGN,
     STATE_NAMES,
     TRANSLATION,
     get_task,
 )
 
-MANISKILL_CHANNELS = (*TRANSLATION, *ROTATION, GRIPPER)
+CHANNEL_SCALE = {
+    **dict.fromkeys(TRANSLATION, ACTION_SCALE),
+    **dict.fromkeys(ROTATION, ROTATION_SIGN * ACTION_SCALE),
+    GRIPPER: 1.0,
+}
+"""Metres or radians that ManiSkill calls 1.0; divided by, because its reciprocal rounds otherwise and data sets must
+replay bit for bit."""
+
+MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
 
-RENDER_BACKENDS = ("auto", "gpu", "cpu")
+RENDER_BACKENDS = ("auto", "gpu", "cpu", "none")
 
 
 class ConstructSkillEnv(gym.Env):
     """A task of the contract table for LeRobot's scripts, or for any Gymnasium user.
 
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
-    `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres and the
-    gripper, +1 open, -1 closed, float32; translations beyond 0.1 m are clipped. The reward is the stage reached:
-    0, 0.5 once lifted, 1 once placed. `info` holds `is_success` and the named booleans of the scene, from the
-    first reset on.
+    `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
+    that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. The reward is
+    the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success` and the named booleans of the
+    scene, from the first reset on.
 
     Non-obvious behaviours: the simulator is born on the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
@@ -43,7 +52,8 @@ class ConstructSkillEnv(gym.Env):
         obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
-        render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
+        render_backend: "auto" (a GPU that can render, else the CPU), "gpu", "cpu", or "none": physics alone, ten
+            times as fast, with no camera in the observation; for checking experts.
 
     Raises:
         ValueError: no such task, obs_type or render_backend, or an episode_length below 1.
@@ -73,8 +83,9 @@ class ConstructSkillEnv(gym.Env):
         self.task_description = self._row.instruction
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
+        self._cameras = () if render_backend == "none" else OBS_TYPES[obs_type]
         self._scene_kwargs = {
-            "cameras": OBS_TYPES[obs_type],
+            "cameras": self._cameras,
             "light_robot": light_robot,
             "render_backend": render_backend,
         }
@@ -85,7 +96,7 @@ class ConstructSkillEnv(gym.Env):
 
     def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        space = {"pixels": spaces.Dict(dict.fromkeys(OBS_TYPES[self.obs_type], image))}
+        space = {"pixels": spaces.Dict(dict.fromkeys(self._cameras, image))}
         if self.obs_type == "pixels_agent_pos":
             space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
         return spaces.Dict(space)
@@ -165,9 +176,9 @@ class ConstructSkillEnv(gym.Env):
         return gym.make(
             self._row.env_id,
             num_envs=num_envs,
-            obs_mode="rgb",
+            obs_mode="rgb" if self._cameras else "none",
             reward_mode="sparse",
-            render_mode="rgb_array",
+            render_mode="rgb_array" if self._cameras else None,
             max_episode_steps=None,
             disable_env_checker=True,
             **self._scene_kwargs,
@@ -186,12 +197,11 @@ class ConstructSkillEnv(gym.Env):
             raise ValueError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
         scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
         for name, value in zip(names, action, strict=True):
-            scaled[MANISKILL_CHANNELS.index(name)] = value if name == GRIPPER else value / ACTION_SCALE
+            scaled[MANISKILL_CHANNELS.index(name)] = value / CHANNEL_SCALE[name]
         return np.clip(scaled, -1, 1)
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
-        cameras = OBS_TYPES[self.obs_type]
-        pixels = {name: obs["sensor_data"][name]["rgb"][0].cpu().numpy() for name in cameras}
+        pixels = {name: obs["sensor_data"][name]["rgb"][0].cpu().numpy() for name in self._cameras}
         if self.obs_type == "pixels":
             return {"pixels": pixels}
         return {"pixels": pixels, "agent_pos": self.agent_state()}

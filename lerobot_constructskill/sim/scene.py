@@ -9,6 +9,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
 from mani_skill.utils.sapien_utils import look_at
@@ -26,6 +27,7 @@ from lerobot_constructskill.contract import (
     ROBOT_BASE,
     Camera,
 )
+from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
 
 WALL = 0.005
@@ -96,9 +98,15 @@ class PickPlaceEnv(BaseEnv):
     bin_center = (0.0, -0.35)
     bin_interior = (0.25, 0.20, 0.15)
 
+    bin_floor = WALL
+    """Height of the floor that a placed object stands on, in metres."""
+
     # The initial-state distribution, in metres and radians.
     spawn_range = 0.10
     yaw_range = np.pi
+
+    hold: Hold | None = None
+    """Which rotations of the hand the scene holds, whatever the action says; the paper's scene holds none."""
 
     def __init__(
         self,
@@ -232,12 +240,24 @@ class PickPlaceEnv(BaseEnv):
         scale = np.array([self.spawn_range, self.spawn_range, self.yaw_range])
         return np.reshape(rng.uniform(-1, 1, size=3), (-1, 3)) * scale
 
+    # Action
+
+    def _step_action(self, action):
+        if self.hold is not None:
+            action = self.hold.apply(common.to_tensor(action, device=self.device), self.agent.tcp.pose.q)
+        return super()._step_action(action)
+
     # Success
 
     @property
     def bin_position(self) -> tuple[float, float, float]:
         """Centre of the bin's interior, in metres."""
-        return (*self.bin_center, WALL + self.bin_interior[2] / 2)
+        return (*self.bin_center, self.bin_floor + self.bin_interior[2] / 2)
+
+    @property
+    def rest_position(self) -> tuple[float, float, float]:
+        """Where the object's centre is once it stands in the middle of the bin, in metres."""
+        return (*self.bin_center, self.bin_floor + self.object_size[2] / 2)
 
     @property
     def placement_bounds(self) -> tuple[float, float, float]:
@@ -265,7 +285,7 @@ class PickPlaceEnv(BaseEnv):
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:
         """The stage reached, of shape (num_envs,)."""
-        reached = torch.where(info["is_placed"], REWARD_PLACED, 0.0)
+        reached = torch.where(info["success"], REWARD_PLACED, 0.0)
         return torch.where(info["is_lifted"], reached.clamp(min=REWARD_LIFTED), reached)
 
     # Observations

@@ -16,6 +16,8 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "generate"
 NO_NOISE = NoiseConfig(sigma=0.0)
+PAPER_END = [-0.03045, -0.37334, 0.11969]
+"""Where the brick is in the last frame of the first noisy demonstration, in metres."""
 
 
 def state(**changes):
@@ -33,7 +35,7 @@ def state(**changes):
 
 @pytest.fixture(scope="module", params=TASKS)
 def env(request):
-    env = ConstructSkillEnv(request.param, episode_length=300)
+    env = ConstructSkillEnv(request.param, render_backend="none")
     yield env
     env.close()
 
@@ -123,10 +125,22 @@ def test_every_expert_succeeds_without_noise_through_all_phases_in_order(env):
 
 
 @pytest.mark.sim
-def test_every_expert_succeeds_in_nine_of_ten_noisy_attempts(env):
+def test_every_expert_succeeds_in_as_many_of_ten_noisy_attempts_as_its_row_says(env):
     expert = make_expert(TASKS[env.task], ExpertConfig())
     outcomes = [demonstrate(env, expert, NoiseConfig(), DEMO_SEED_START + i)[1] for i in range(10)]
-    assert sum(outcomes) >= 9
+    assert np.mean(outcomes) >= TASKS[env.task].noisy_yield
+
+
+@pytest.mark.sim
+def test_the_papers_demonstration_is_the_one_it_always_was():
+    """Data sets replay, and compare, only while physics, expert and noise are what they were (CPU physics)."""
+    env = ConstructSkillEnv("brick_to_bin", render_backend="none")
+    frames, success = demonstrate(
+        env, make_expert(TASKS["brick_to_bin"], ExpertConfig()), NoiseConfig(), DEMO_SEED_START
+    )
+    env.close()
+    assert success and len(frames) == 110
+    np.testing.assert_allclose(frames[-1]["sim.object_pose"][:3], PAPER_END, atol=1e-4)
 
 
 @pytest.mark.sim

@@ -65,6 +65,25 @@ def test_config_and_environment_declare_the_same_features(task, obs_type):
     assert env_to_policy_features(config) == features
 
 
+def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with():
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 4)).astype(np.float32)
+    sent = np.array([ConstructSkillEnv()._maniskill_action(action)[:3] for action in actions])
+    np.testing.assert_array_equal(sent, actions[:, :3] / np.float32(ACTION_SCALE))
+
+
+@pytest.mark.sim
+def test_a_positive_dyaw_turns_the_hand_to_the_left_by_about_a_third_of_what_was_asked():
+    env = ConstructSkillEnv("brick_to_bin_turned", render_backend="none")
+    env.reset(seed=0)
+    before = env.privileged_state()["tcp_pose"]
+    for _ in range(5):
+        env.step(np.array([0, 0, 0, 0.1, 1], dtype=np.float32))
+    after = env.privileged_state()["tcp_pose"]
+    env.close()
+    turned = 2 * np.arctan2(after[5], after[4]) - 2 * np.arctan2(before[5], before[4])
+    assert 0.1 < turned < 0.5
+
+
 def test_stepping_before_the_first_reset_is_refused():
     with pytest.raises(RuntimeError, match="reset"):
         ConstructSkillEnv().step(HOVER)

@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 import torch
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_multiply
 from mani_skill.utils.structs import Pose
 
 import lerobot_constructskill.sim.register  # noqa: F401
-from lerobot_constructskill.contract import IMAGE_SIZE, SIM_STATE, TASKS
+from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
+from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
 
 pytestmark = pytest.mark.sim
@@ -125,11 +127,11 @@ def test_the_papers_bounds_follow_from_the_bins_geometry():
 
 def test_placement_takes_five_consecutive_steps_with_the_gripper_open(blind):
     blind.reset(seed=0)
-    inside = [*blind.bin_center, 0.005 + blind.object_size[2] / 2]
+    inside = list(blind.rest_position)
     move_object(blind, inside)
     for _ in range(PLACED_STEPS - 1):
         *_, info = blind.step(HOLD_OPEN)
-        assert info["is_in_bin"] and info["is_gripper_open"] and not info["is_placed"]
+        assert info["is_in_bin"] and info["is_gripper_open"] and not info["success"]
     move_object(blind, [0.3, 0.0, blind.object_size[2] / 2])
     *_, info = blind.step(HOLD_OPEN)
     assert not info["is_in_bin"] and not info["success"]
@@ -142,7 +144,7 @@ def test_a_closed_gripper_is_no_placement(blind):
     blind.reset(seed=0)
     for _ in range(PLACED_STEPS):
         blind.step(HOLD_CLOSED)
-    move_object(blind, [*blind.bin_center, 0.005 + blind.object_size[2] / 2])
+    move_object(blind, list(blind.rest_position))
     for _ in range(2 * PLACED_STEPS):
         *_, info = blind.step(HOLD_CLOSED)
     assert info["is_in_bin"] and not info["is_gripper_open"] and not info["success"]
@@ -150,7 +152,7 @@ def test_a_closed_gripper_is_no_placement(blind):
 
 def test_asking_twice_changes_no_outcome(blind):
     blind.reset(seed=0)
-    move_object(blind, [*blind.bin_center, 0.005 + blind.object_size[2] / 2])
+    move_object(blind, list(blind.rest_position))
     for _ in range(PLACED_STEPS - 1):
         blind.step(HOLD_OPEN)
         first, second = blind.evaluate(), blind.evaluate()
@@ -167,6 +169,39 @@ def test_lifted_holds_for_the_rest_of_the_episode_and_not_for_the_next(blind):
     assert info["is_lifted"] and reward.shape == (1,)
     _, info = blind.reset(seed=0)
     assert not info["is_lifted"]
+
+
+@pytest.mark.parametrize("task, clearance", LADDER.items())
+def test_a_rung_of_the_ladder_has_its_clearance_and_the_fingers_open_above_its_rim(task, clearance):
+    env = make(task)
+    np.testing.assert_allclose(np.subtract(env.bin_interior, env.object_size)[:2], clearance)
+    tips = env.rest_position[2] + env.object_size[2] / 2 - 0.039
+    assert tips > env.bin_position[2] + env.bin_interior[2] / 2
+    env.close()
+
+
+def test_a_brick_that_leans_on_the_rim_is_placed_as_the_paper_counts_and_not_strictly():
+    env = make("brick_to_bin_40mm")
+    env.reset(seed=0)
+    for _ in range(PLACED_STEPS):
+        x, y, z = env.rest_position
+        env.object.set_pose(
+            Pose.create_from_pq(torch.tensor([[x, y, z + 0.022]]), torch.tensor([[0.995, 0, 0.0998, 0]]))
+        )
+        *_, info = env.step(HOLD_OPEN)
+    assert info["is_placed"] and not info["is_upright"] and not info["success"]
+    env.close()
+
+
+def test_a_held_hand_stays_level_under_the_brick_and_keeps_the_yaw_it_was_given():
+    hand = torch.tensor([[0.02, 0.98, 0.17, 0.03]])
+    hand /= hand.norm()
+    action = torch.tensor([0.1, 0.2, 0.3, 9.0, 9.0, 0.7, 1.0])
+    turning, fixed = Hold(yaw=False), Hold(yaw=True)
+    assert turning.apply(action, hand)[[0, 1, 2, 5, 6]].tolist() == action[[0, 1, 2, 5, 6]].tolist()
+    assert abs(float(turning.correction(hand)[0, 2])) < 0.01 < abs(float(fixed.correction(hand)[0, 2]))
+    level = quaternion_multiply(axis_angle_to_quaternion(turning.correction(hand)), hand)
+    torch.testing.assert_close(level[:, [0, 3]], torch.zeros(1, 2), atol=2e-3, rtol=0)
 
 
 def test_privileged_state_is_what_the_contract_says(blind):

@@ -36,13 +36,16 @@ class BrickToBinEnv(PickPlaceEnv):
     yaw_range = 0.0
 
     def _load_object(self, builder: ActorBuilder) -> None:
+        self._add_brick(builder, sapien.Pose())
+
+    def _add_brick(self, builder: ActorBuilder, pose: sapien.Pose) -> None:
         x, y, z = half_size = np.array(self.object_size) / 2
-        builder.add_box_collision(half_size=half_size, density=CLAY_DENSITY)
+        builder.add_box_collision(pose, half_size, density=CLAY_DENSITY)
         if self.scene.can_render():
             clay = mottled(CLAY_RED, contrast=0.12, size=512)
             # SAPIEN unfolds a box on its texture as a cross of 3 x 4 faces: 2 x 5 holes a face.
             bed = perforated(clay, rows=3 * 2, columns=4 * 5, radius=0.28)
-            builder.add_box_visual(half_size=half_size, material=textured(clay))
+            builder.add_box_visual(pose, half_size, material=textured(clay))
             for side in (-1, 1):  # a skin on each bed face shows the perforations
-                pose = sapien.Pose([0, side * y, 0])
-                builder.add_box_visual(pose, [x, SKIN, z], material=textured(bed))
+                skin = pose * sapien.Pose([0, side * y, 0])
+                builder.add_box_visual(skin, [x, SKIN, z], material=textured(bed))

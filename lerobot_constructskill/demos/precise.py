@@ -1,0 +1,156 @@
+"""The expert of tasks with little play: it watches the object, not only the hand, and lowers it into place.
+
+The six phases are the pick-and-place expert's. CARRY ends over the receptacle; RELEASE, in which no noise is added,
+aligns the object, lowers it and opens the jaws.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
+from lerobot_constructskill.demos.expert import Phase, PrivilegedState, Progress
+from lerobot_constructskill.demos.pick_place import GRAVITY, GRIPPER, PickPlaceExpert
+
+RELEASE_GAP = 0.003
+"""Height in metres over the floor of the receptacle from which an object may drop."""
+
+TIP_CLEARANCE = 0.02
+"""Distance in metres from the TCP down to the rim that open fingers keep; their tips are 9 mm below it."""
+
+CENTRED = np.array([0.003, 0.003, 0.006])
+"""Largest error of the hand in metres with which the jaws close: an object held off its centre, or by less of the
+fingers, swings between them when it is lifted."""
+
+DRAWN_IN = 0.00032
+"""Translation away from the base asked for per newton of held weight, in m/N: an arm that sags draws the hand in."""
+
+ALIGNING_GAIN = 1.2
+"""Above 1.5 the held object rocks between the fingers, two steps to a swing."""
+
+LOWERING_STEP = 0.008
+"""Largest translation asked for per axis and step in RELEASE, in metres."""
+
+FINEST, COARSEST = 0.0008, 0.005
+"""Bounds on the error in metres that RELEASE accepts before it lowers; in between, half the play."""
+
+YAW_STEP, YAW_TOLERANCE = 0.1, 0.03
+"""Largest rotation asked for in a step, and the error at which a phase may end, in radians."""
+
+OPENED = 0.036
+"""Position in metres at which a finger no longer holds anything."""
+
+
+@dataclass(frozen=True)
+class PreciseExpert(PickPlaceExpert):
+    """Closes the loop on the object's pose from CARRY on."""
+
+    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+        if progress.phase is Phase.CARRY:
+            return bool(np.linalg.norm(self._carry_error(state)) < self.config.threshold)
+        is_near = super()._is_over(state, progress)
+        if progress.phase is Phase.DESCEND:
+            error = abs(self._grasp_point(state) - state.tcp)
+            return is_near and (error < CENTRED).all()
+        return is_near
+
+    def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
+        """Once the hand has risen well clear of the object."""
+        risen = state.tcp[2] - _top(state)
+        return after.phase is Phase.RELEASE and risen > self.config.pregrasp_clearance
+
+    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        match progress.phase:
+            case Phase.CARRY:
+                moved = self._toward(self._carry_error(state), self.config.load_max_step)
+                return np.array([*moved + self._weight_compensation(state), GRIPPER_CLOSED])
+            case Phase.RELEASE:
+                return self._release(state)
+        return np.array([*self._translation(state, progress), GRIPPER[progress.phase]])
+
+    def _carry_error(self, state: PrivilegedState) -> np.ndarray:
+        """From the object's centre to the point where its underside is `release_clearance` above the rim, (3,)."""
+        above = _rim(state) + self.config.release_clearance + state.object_size[2] / 2
+        return np.array([*state.bin_position[:2], above]) - state.object_pose[:3]
+
+    def _release(self, state: PrivilegedState) -> np.ndarray:
+        gap = _lowest(state, self.config.finger_depth) - _underside(state)
+        if min(state.fingers) > OPENED:
+            return np.array([0, 0, self.config.max_step, GRIPPER_OPEN])
+        if gap > -RELEASE_GAP:
+            return np.array([0, 0, 0, GRIPPER_OPEN])
+        error = self._carry_error(state)
+        haste = self._haste(state, error)
+        error[2] = haste * (gap - RELEASE_GAP) + (1 - haste) * error[2]
+        step = np.clip(ALIGNING_GAIN * error, -LOWERING_STEP, LOWERING_STEP)
+        return np.array([*step + self._weight_compensation(state) + _outward(state), GRIPPER_CLOSED])
+
+    def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
+        """How fast to lower, 0 to 1: not at all until the object is over the opening, and gradually from there."""
+        if _underside(state) < _rim(state):
+            return 1.0
+        play = (state.bin_interior - state.object_size)[:2] / 2
+        accepted = np.clip(play / 2, FINEST, COARSEST)
+        return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
+
+
+@dataclass(frozen=True)
+class TurningExpert(PreciseExpert):
+    """Turns the jaws to the object and the object to the receptacle, whose faces are alike after half a turn."""
+
+    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+        turns = progress.phase in (Phase.PREGRASP, Phase.CARRY)
+        is_turned = abs(self._yaw_error(state, progress)) < YAW_TOLERANCE
+        return super()._is_over(state, progress) and (is_turned or not turns)
+
+    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        *translation, gripper = super()._action(state, progress)
+        turn = np.clip(self._yaw_error(state, progress), -YAW_STEP, YAW_STEP)
+        return np.array([*translation, turn, gripper])
+
+    def _yaw_error(self, state: PrivilegedState, progress: Progress) -> float:
+        w, x, y, z = state.object_pose[3:]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        match progress.phase:
+            case Phase.PREGRASP | Phase.DESCEND:
+                jaws = np.arctan2(-state.jaw_axis[0], state.jaw_axis[1])
+                return _half_turn(yaw - jaws)
+            case Phase.LIFT | Phase.CARRY:
+                return _half_turn(-yaw) * (progress.phase is Phase.CARRY)
+        return 0.0
+
+
+def _half_turn(angle: float) -> float:
+    """`angle` in radians, less whole half turns: within a quarter turn of zero."""
+    return (angle + np.pi / 2) % np.pi - np.pi / 2
+
+
+def _outward(state: PrivilegedState) -> np.ndarray:
+    """Translation that holds a loaded arm out, (3,) metres."""
+    radius = (state.tcp - ROBOT_BASE) * [1, 1, 0]
+    return DRAWN_IN * GRAVITY * state.object_mass[0] * radius / np.linalg.norm(radius)
+
+
+def _up(state: PrivilegedState) -> np.ndarray:
+    """World height of the ends of the object's three axes, (3,); (0, 0, 1) where it is level."""
+    w, x, y, z = state.object_pose[3:]
+    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+
+
+def _underside(state: PrivilegedState) -> float:
+    """Height of the object's lowest corner, in metres."""
+    return state.object_pose[2] - abs(_up(state)) @ state.object_size / 2
+
+
+def _top(state: PrivilegedState) -> float:
+    return state.object_pose[2] + state.object_size[2] / 2
+
+
+def _rim(state: PrivilegedState) -> float:
+    return state.bin_position[2] + state.bin_interior[2] / 2
+
+
+def _lowest(state: PrivilegedState, finger_depth: float) -> float:
+    """Lowest height of the object's underside, in metres: on the floor, or where the fingers would meet the rim."""
+    floor = state.bin_position[2] - state.bin_interior[2] / 2
+    return max(floor, _rim(state) + TIP_CLEARANCE - (state.object_size[2] - finger_depth))
