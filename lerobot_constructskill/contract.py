@@ -207,5 +207,39 @@ def get_task(name: str) -> Task:
         ValueError: there is no such task; the message lists those there are.
     """
     if name not in TASKS:
-        raise ValueError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}.")
+        raise ValueError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {', '.join(SUITES)}.")
     return TASKS[name]
+
+
+SUITES = {
+    "bins": ("brick_to_bin", "brick_to_bin_shifted", "block_to_bin"),
+    "ladder": tuple(LADDER),
+    "joints": ("brick_on_brick", "tile_to_grid", "tenon_to_mortise"),
+}
+"""Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
+
+LOOSE = "constructskill"
+"""The suite under which results of tasks that were named one by one are kept."""
+
+
+def select_tasks(names: str) -> dict[str, list[Task]]:
+    """The rows that `names` asks for, by suite.
+
+    Args:
+        names: a task, a suite, or several of them with commas between.
+
+    Raises:
+        ValueError: a name is neither a task nor a suite, is given twice, or the tasks differ in their action.
+    """
+    selected: dict[str, list[Task]] = {}
+    for name in (part.strip() for part in names.split(",")):
+        suite, members = (name, SUITES[name]) if name in SUITES else (LOOSE, (name,))
+        selected.setdefault(suite, []).extend(get_task(member) for member in members)
+    rows = [row for suite in selected.values() for row in suite]
+    if len(set(rows)) < len(rows):
+        raise ValueError(f"'{names}' names a task twice; name each once.")
+    if len({row.action_names for row in rows}) > 1:
+        raise ValueError(
+            f"'{names}' mixes tasks whose actions differ; choose tasks that share {rows[0].action_names}."
+        )
+    return selected

@@ -10,7 +10,7 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, get_task
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 
@@ -23,7 +23,8 @@ class ConstructSkillEnvConfig(EnvConfig):
     """ConstructSkill's tasks for `lerobot-train` and `lerobot-eval`.
 
     Args:
-        task: a name in `contract.TASKS`.
+        task: a name in `contract.TASKS` or in `contract.SUITES`, or several with commas between; their actions must
+            be alike.
         obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the 8-number
             state, for policies that need them).
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
@@ -50,9 +51,10 @@ class ConstructSkillEnvConfig(EnvConfig):
         if self.vectorization not in VECTORIZATIONS:
             choices = " or ".join(VECTORIZATIONS)
             raise ValueError(f"vectorization must be {choices}, not '{self.vectorization}'.")
-        row = get_task(self.task)
-        self._make_env()  # refuses what no environment can be made with
-        self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(row.action_names),))}
+        rows = [row for suite in select_tasks(self.task).values() for row in suite]
+        for row in rows:
+            self._make_env(row.name)  # refuses what no environment can be made with
+        self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),))}
         self.features_map = {"action": "action"}
         for name in OBS_TYPES[self.obs_type]:
             key = CAMERAS[name].key
@@ -67,22 +69,26 @@ class ConstructSkillEnvConfig(EnvConfig):
         names = ("task", "obs_type", "episode_length", "light_robot", "render_backend")
         return {name: getattr(self, name) for name in names}
 
-    def _make_env(self) -> ConstructSkillEnv:
-        return ConstructSkillEnv(**self.gym_kwargs)
+    def _make_env(self, task: str) -> ConstructSkillEnv:
+        return ConstructSkillEnv(**self.gym_kwargs | {"task": task})
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """`{"constructskill": {0: vector environment}}`; every sub-environment freezes after its episode's end."""
+        """`{suite: {task number: vector environment}}`; every sub-environment freezes after its episode's end."""
+        return {
+            suite: {i: self._vector_env(row.name, n_envs, use_async_envs) for i, row in enumerate(rows)}
+            for suite, rows in select_tasks(self.task).items()
+        }
+
+    def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:
+        kwargs = self.gym_kwargs | {"task": task}
         if self.vectorization == "native":
-            return {self.type: {0: NativeVectorEnv(n_envs, **self.gym_kwargs)}}
-        env_fns = [partial(ConstructSkillEnv, **self.gym_kwargs) for _ in range(n_envs)]
+            return NativeVectorEnv(n_envs, **kwargs)
+        env_fns = [partial(ConstructSkillEnv, **kwargs) for _ in range(n_envs)]
         if use_async_envs and n_envs > 1:
             # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.
             multiprocessing.set_forkserver_preload(["lerobot.envs.utils", "lerobot_constructskill.sim.register"])
-            probe = self._make_env()
-            vector = _LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
-        else:
-            vector = gym.vector.SyncVectorEnv(
-                [freeze_after_episode_end(fn) for fn in env_fns],
-                autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP,
-            )
-        return {self.type: {0: vector}}
+            probe = self._make_env(task)
+            return _LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
+        return gym.vector.SyncVectorEnv(
+            [freeze_after_episode_end(fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+        )

@@ -13,7 +13,7 @@ from lerobot.envs.utils import (
     preprocess_observation,
 )
 
-from lerobot_constructskill.contract import ACTION_SCALE, IMAGE_SIZE, OBS_TYPES, TASKS
+from lerobot_constructskill.contract import ACTION_SCALE, IMAGE_SIZE, OBS_TYPES, SUITES, TASKS
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -63,6 +63,27 @@ def test_config_and_environment_declare_the_same_features(task, obs_type):
     assert env._max_episode_steps == TASKS[task].horizon
     config.__post_init__()
     assert env_to_policy_features(config) == features
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_a_suite_is_one_vector_environment_a_task_under_its_name(suite):
+    envs = ConstructSkillEnvConfig(task=suite).create_envs(n_envs=1)
+    assert {name: [vector.call("task")[0] for vector in tasks.values()] for name, tasks in envs.items()} == {
+        suite: list(SUITES[suite])
+    }
+
+
+def test_tasks_and_suites_can_be_named_together():
+    envs = ConstructSkillEnvConfig(task="brick_to_bin,joints, block_to_bin").create_envs(n_envs=1)
+    assert {suite: list(tasks) for suite, tasks in envs.items()} == {"constructskill": [0, 1], "joints": [0, 1, 2]}
+
+
+@pytest.mark.parametrize(
+    "task, word", [("brick_to_bin,brick_to_bin_turned", "actions differ"), ("bins,brick_to_bin", "twice")]
+)
+def test_selections_that_no_policy_could_be_asked_are_refused(task, word):
+    with pytest.raises(ValueError, match=word):
+        ConstructSkillEnvConfig(task=task)
 
 
 def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with():
