@@ -1,0 +1,124 @@
+"""`constructskill-check-task`: what a new task owes: its tests, its expert's success, and a sheet to look at."""
+
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_constructskill.contract import DEMO_SEED_START, get_task
+from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.scripts.console import run
+
+TILE = 224
+"""Height and width of a picture in the contact sheet, in pixels."""
+
+REQUIRED = 0.95
+"""Share of random initial states in which an expert must succeed."""
+
+
+@dataclass
+class CheckConfig:
+    """Check one task of the contract table.
+
+    Raises:
+        ValueError: there is no such task, the counts are out of range, or the task fails its check.
+    """
+
+    task: str
+    states: int = 100  # random initial states, without rendering
+    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    folder: Path = Path("outputs/check")  # where the contact sheet goes
+    tests: bool = True  # run the registry tests of this task; needs a checkout
+
+    def __post_init__(self):
+        get_task(self.task)
+        if self.states < 1:
+            raise ValueError(f"states must be at least 1, not {self.states}.")
+
+
+def check(config: CheckConfig) -> str:
+    sheet = save_contact_sheet(config)
+    lengths, failures = measure_expert(config)
+    low, high = clopper_pearson(config.states - len(failures), config.states)
+    report = (
+        f"{config.task}: the expert succeeds in {config.states - len(failures)} of {config.states} initial states "
+        f"(95 % Clopper-Pearson {low:.1%} to {high:.1%}), in at most {max(lengths, default=0)} of "
+        f"{get_task(config.task).horizon} steps. Look at {sheet}."
+    )
+    if len(failures) > (1 - REQUIRED) * config.states:
+        raise ValueError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
+    if config.tests and (code := run_tests(config.task)):
+        raise ValueError(f"{report} Its tests failed with status {code}; pytest tells why above.")
+    return report
+
+
+def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
+    """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
+    from tqdm import trange
+
+    from lerobot_constructskill.demos.demonstrate import demonstrate
+    from lerobot_constructskill.demos.expert import make_expert
+    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+    env = ConstructSkillEnv(config.task, render_backend="none")
+    expert = make_expert(get_task(config.task), config.expert)
+    lengths, failures = [], []
+    for seed in trange(DEMO_SEED_START, DEMO_SEED_START + config.states, desc=config.task, unit="state"):
+        frames, success = demonstrate(env, expert, config.noise, seed)
+        if success:
+            lengths.append(len(frames))
+        else:
+            failures.append(seed)
+    env.close()
+    return lengths, failures
+
+
+def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
+    """The exact 95 % interval of a share (Clopper and Pearson 1934)."""
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
+    return interval.low, interval.high
+
+
+def save_contact_sheet(config: CheckConfig) -> Path:
+    """Save the start of each phase and the end, the policy's view above a close-up, and return the picture's path."""
+    import numpy as np
+    from PIL import Image
+
+    from lerobot_constructskill.demos.expert import PrivilegedState, make_expert
+    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+    env = ConstructSkillEnv(config.task)
+    expert = make_expert(get_task(config.task), config.expert)
+    obs, _ = env.reset(seed=DEMO_SEED_START)
+    state = PrivilegedState(**env.privileged_state())
+    progress, over, columns = expert.start(state), False, {}
+    while progress is not None and not over:
+        action, phase, progress = expert.act(state, progress)
+        if phase not in columns:
+            columns[phase] = (obs["pixels"]["base"], env.render())
+        obs, _, success, truncated, _ = env.step(action)
+        state, over = PrivilegedState(**env.privileged_state()), success or truncated
+    columns["end"] = (obs["pixels"]["base"], env.render())
+    env.close()
+    tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
+    path = config.folder / f"{config.task}.png"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate([np.concatenate(pair) for pair in tiles], axis=1)).save(path)
+    return path
+
+
+def run_tests(task: str) -> int:
+    """Exit status of every test that names `task`."""
+    return subprocess.run([sys.executable, "-m", "pytest", "-q", "-k", f"[{task}]"], check=False).returncode
+
+
+def main() -> None:
+    run(CheckConfig, check)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,40 @@
+"""The checking command of a new task."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.scripts.check_task import CheckConfig, check, clopper_pearson
+
+
+@pytest.mark.parametrize("successes", [0, 3, 95, 100])
+def test_the_interval_holds_the_share_and_narrows_with_more_states(successes):
+    low, high = clopper_pearson(successes, 100)
+    wide_low, wide_high = clopper_pearson(successes // 5, 20)
+    assert 0 <= low <= successes / 100 <= high <= 1 and high - low < wide_high - wide_low
+
+
+def test_the_interval_is_the_textbooks():
+    assert clopper_pearson(0, 10) == pytest.approx((0, 1 - 0.025 ** (1 / 10)))
+
+
+@pytest.mark.parametrize("bad", [{"task": "lintel"}, {"task": "brick_to_bin", "states": 0}])
+def test_bad_input_is_refused(bad):
+    with pytest.raises(ValueError, match="lintel|states"):
+        CheckConfig(**bad)
+
+
+@pytest.mark.sim
+def test_a_good_task_is_reported_with_its_interval_and_a_sheet(tmp_path):
+    report = check(CheckConfig("block_to_bin", states=2, folder=tmp_path, tests=False))
+    assert "2 of 2" in report and "15.8%" in report
+    assert np.asarray(Image.open(tmp_path / "block_to_bin.png")).std() > 10
+
+
+@pytest.mark.sim
+def test_an_expert_that_fails_fails_the_check_and_names_the_seeds(tmp_path):
+    drops = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
+    config = CheckConfig("brick_to_bin_turned", states=1, folder=tmp_path, tests=False, expert=drops)
+    with pytest.raises(ValueError, match=r"0 of 1 .* seeds \[1000000\]"):
+        check(config)
