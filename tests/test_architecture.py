@@ -17,8 +17,9 @@ SIMULATOR = {"sapien", "mani_skill", "mplib"}
 ARROWS = {
     "contract": (),
     "policies": (),
-    "sim": ("contract",),
-    "envs": ("contract",),
+    "perturbations": (),
+    "sim": ("contract", "perturbations"),
+    "envs": ("contract", "perturbations"),
     "plugin": ("envs", "policies"),
     "staging": (),
     "pools": (),
@@ -52,6 +53,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 # Files that name every package they may import.
 EXTERNALS = {
     "contract": set(),
+    "perturbations": set(),
     "staging": set(),
     "study.stats": {"numpy", "pandas", "scipy", "statsmodels"},
     "study.report": {"draccus", "jinja2", "markupsafe", "matplotlib", "numpy", "pandas", "yaml"},

@@ -13,6 +13,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
 
@@ -33,6 +34,9 @@ class ConstructSkillEnvConfig(EnvConfig):
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
         vectorization: "process" (a simulator for each environment) or "native" (one for all, which needs a GPU for
             more than one environment).
+        perturb: `axis=level` with commas between, as `perturbations.AXES` lists them, such as `camera=2,light=1`; the
+            names under which LeRobot keeps the results end in it.
+        perturb_seed: seed of what a perturbation draws once.
     """
 
     task: str = "brick_to_bin"
@@ -42,6 +46,8 @@ class ConstructSkillEnvConfig(EnvConfig):
     light_robot: bool | None = None
     render_backend: str = "auto"
     vectorization: str = "process"
+    perturb: str = ""
+    perturb_seed: int = 0
 
     def __post_init__(self):
         if self.max_parallel_tasks != 1:
@@ -51,6 +57,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         if self.vectorization not in VECTORIZATIONS:
             choices = " or ".join(VECTORIZATIONS)
             raise ValueError(f"vectorization must be {choices}, not '{self.vectorization}'.")
+        if self.vectorization == "native" and self.perturb:
+            raise ValueError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
         rows = [row for suite in select_tasks(self.task).values() for row in suite]
         for row in rows:
             self._make_env(row.name)  # refuses what no environment can be made with
@@ -66,7 +74,7 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        names = ("task", "obs_type", "episode_length", "light_robot", "render_backend")
+        names = ("task", "obs_type", "episode_length", "light_robot", "render_backend", "perturb", "perturb_seed")
         return {name: getattr(self, name) for name in names}
 
     def _make_env(self, task: str) -> ConstructSkillEnv:
@@ -74,8 +82,9 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """`{suite: {task number: vector environment}}`; every sub-environment freezes after its episode's end."""
+        label = Perturbation(self.perturb, self.perturb_seed).label
         return {
-            suite: {i: self._vector_env(row.name, n_envs, use_async_envs) for i, row in enumerate(rows)}
+            suite + label: {i: self._vector_env(row.name, n_envs, use_async_envs) for i, row in enumerate(rows)}
             for suite, rows in select_tasks(self.task).items()
         }
 

@@ -20,6 +20,7 @@ from lerobot_constructskill.contract import (
     TRANSLATION,
     get_task,
 )
+from lerobot_constructskill.perturbations import Perturbation
 
 CHANNEL_SCALE = {
     **dict.fromkeys(TRANSLATION, ACTION_SCALE),
@@ -54,9 +55,11 @@ class ConstructSkillEnv(gym.Env):
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu", "cpu", or "none": physics alone, ten
             times as fast, with no camera in the observation; for checking experts.
+        perturb: `axis=level` with commas between, as `perturbations.AXES` lists them; empty for none.
+        perturb_seed: seed of what a perturbation draws once.
 
     Raises:
-        ValueError: no such task, obs_type or render_backend, or an episode_length below 1.
+        ValueError: no such task, obs_type, render_backend, axis or level, or an episode_length below 1.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -69,7 +72,10 @@ class ConstructSkillEnv(gym.Env):
         episode_length: int | None = None,
         light_robot: bool | None = None,
         render_backend: str = "auto",
+        perturb: str = "",
+        perturb_seed: int = 0,
     ):
+        self._perturbation = Perturbation(perturb, perturb_seed)
         self._row = get_task(task)
         if obs_type not in OBS_TYPES:
             raise ValueError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
@@ -88,6 +94,7 @@ class ConstructSkillEnv(gym.Env):
             "cameras": self._cameras,
             "light_robot": light_robot,
             "render_backend": render_backend,
+            "perturbation": self._perturbation,
         }
         self._env = None
         self._steps = 0
@@ -120,6 +127,7 @@ class ConstructSkillEnv(gym.Env):
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.2 s.
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
+        self._pixel_rng = np.random.default_rng([seed, self._perturbation.seed])
         return self._observation(obs), self._info(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -201,10 +209,18 @@ class ConstructSkillEnv(gym.Env):
         return np.clip(scaled, -1, 1)
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
-        pixels = {name: obs["sensor_data"][name]["rgb"][0].cpu().numpy() for name in self._cameras}
+        pixels = {name: self._sensed(obs["sensor_data"][name]["rgb"][0].cpu().numpy()) for name in self._cameras}
         if self.obs_type == "pixels":
             return {"pixels": pixels}
         return {"pixels": pixels, "agent_pos": self.agent_state()}
+
+    def _sensed(self, image: np.ndarray) -> np.ndarray:
+        """`image`, (H, W, 3) uint8, as a noisy sensor sees it."""
+        sigma = self._perturbation.amount("sensor")
+        if not sigma:
+            return image
+        noisy = image + sigma * self._pixel_rng.standard_normal(image.shape)
+        return np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}

@@ -27,7 +27,9 @@ from lerobot_constructskill.contract import (
     ROBOT_BASE,
     Camera,
 )
+from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
+from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
 
 WALL = 0.005
@@ -80,10 +82,12 @@ class PickPlaceEnv(BaseEnv):
         cameras: names of the cameras in `contract.CAMERAS` to observe with; the paper's sole view by default.
         light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
         robot_uids: ManiSkill's; the Panda by default, drawn as `light_robot` says.
+        perturbation: what differs from the task as it is; nothing by default.
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
         OSError: there is no Vulkan device to render with.
+        ValueError: another brick size is asked of a task without a brick.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
     environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
@@ -105,6 +109,9 @@ class PickPlaceEnv(BaseEnv):
     spawn_range = 0.10
     yaw_range = np.pi
 
+    is_brick = False
+    """Whether the object is a brick, whose size may vary within EN 771-1's tolerance."""
+
     hold: Hold | None = None
     """Which rotations of the hand the scene holds, whatever the action says; the paper's scene holds none."""
 
@@ -116,8 +123,14 @@ class PickPlaceEnv(BaseEnv):
         robot_uids: str | None = None,
         control_mode: str = "pd_ee_delta_pose",
         render_backend: str = "auto",
+        perturbation: Perturbation | None = None,
         **kwargs,
     ):
+        self.draws = Draws(perturbation or Perturbation())
+        if self.draws.perturbation.amount("size"):
+            if not self.is_brick:
+                raise ValueError("The axis 'size' is EN 771-1's tolerance of bricks; this task has none.")
+            self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
         self.cameras = tuple(cameras)
@@ -158,7 +171,7 @@ class PickPlaceEnv(BaseEnv):
 
     def _camera_config(self, camera: Camera) -> CameraConfig:
         if camera.mount is None:
-            view = {"pose": look_at(camera.eye, camera.target)}
+            view = {"pose": look_at(self.draws.eye(camera.eye), camera.target)}
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
@@ -174,6 +187,7 @@ class PickPlaceEnv(BaseEnv):
 
     def _load_scene(self, options: dict) -> None:
         self._load_hall()
+        self._load_offcuts()
         self.bin = self._load_bin()
         builder = self.scene.create_actor_builder()
         self._load_object(builder)
@@ -188,7 +202,8 @@ class PickPlaceEnv(BaseEnv):
         builder = self.scene.create_actor_builder()
         builder.add_plane_collision(sapien.Pose(q=euler2quat(0, -np.pi / 2, 0)))
         if self.scene.can_render():
-            screed = textured(mottled((150, 146, 138), contrast=0.05, seed=1))
+            colour, pattern = self.draws.surface("ground", (150, 146, 138), 1)
+            screed = textured(mottled(colour, contrast=0.05, seed=pattern))
             plaster = textured(mottled((222, 217, 206), contrast=0.02, seed=2))
             w, h, t = HALL_HALF_WIDTH, HALL_HEIGHT / 2, 0.01
             builder.add_box_visual(sapien.Pose([0, 0, -t]), [w, w, t], material=screed)
@@ -198,10 +213,21 @@ class PickPlaceEnv(BaseEnv):
         builder.initial_pose = sapien.Pose()
         builder.build_static(name="hall")
 
+    def _load_offcuts(self) -> None:
+        """Distractors: fixed wooden boxes away from the object, the bin and the way between them."""
+        ends = np.array([self.object_center, self.bin_center, ROBOT_BASE[:2]])
+        way = np.linspace(ends[0], ends[1], 5)
+        for i, (size, place) in enumerate(self.draws.offcuts(np.vstack([ends, way]), self.spawn_range + 0.18)):
+            builder = self.scene.create_actor_builder()
+            builder.add_box_collision(half_size=size / 2)
+            builder.add_box_visual(half_size=size / 2, material=(0.55, 0.38, 0.20))
+            builder.initial_pose = sapien.Pose(p=place)
+            builder.build_static(name=f"offcut_{i}")
+
     def _load_lighting(self, options: dict) -> None:
         self.scene.set_ambient_light([0.5, 0.5, 0.5])
-        self.scene.add_directional_light([1, 1, -1], [0.9, 0.9, 0.9], shadow=self.enable_shadow)
-        self.scene.add_directional_light([0, 0, -1], [0.6, 0.6, 0.6])
+        self.scene.add_directional_light(*self.draws.light([1, 1, -1], [0.9, 0.9, 0.9]), shadow=self.enable_shadow)
+        self.scene.add_directional_light(*self.draws.light([0, 0, -1], [0.6, 0.6, 0.6]))
 
     def _load_bin(self) -> Actor:
         """A floor and four walls around `bin_interior`, standing on the ground."""
@@ -221,7 +247,7 @@ class PickPlaceEnv(BaseEnv):
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):
-            self.agent.reset(self.agent.keyframes["rest"].qpos)
+            self.agent.reset(self._initial_qpos(env_idx))
             self.agent.robot.set_pose(sapien.Pose(p=ROBOT_BASE))
             offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
             offsets = offsets.to(self.device)
@@ -234,6 +260,15 @@ class PickPlaceEnv(BaseEnv):
             self._lifted[env_idx] = False
             self._placed[env_idx] = False
             self._last_unsettled[env_idx] = 0
+
+    def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
+        """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
+        rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")
+        if not amount:
+            return rest
+        seeds = [[int(self._episode_seed[i]), self.draws.perturbation.seed] for i in env_idx.cpu()]
+        noise = np.array([np.random.default_rng(seed).standard_normal(len(rest) - 2) for seed in seeds])
+        return rest + amount * np.pad(noise, ((0, 0), (0, 2)))
 
     def _spawn_offsets(self, rng: BatchedRNG) -> np.ndarray:
         """One row (dx, dy, dyaw) per episode generator in `rng`, in metres and radians."""

@@ -34,6 +34,7 @@ class BrickToBinEnv(PickPlaceEnv):
 
     spawn_range = 0.0
     yaw_range = 0.0
+    is_brick = True
 
     def _load_object(self, builder: ActorBuilder) -> None:
         self._add_brick(builder, sapien.Pose())
@@ -42,7 +43,8 @@ class BrickToBinEnv(PickPlaceEnv):
         x, y, z = half_size = np.array(self.object_size) / 2
         builder.add_box_collision(pose, half_size, density=CLAY_DENSITY)
         if self.scene.can_render():
-            clay = mottled(CLAY_RED, contrast=0.12, size=512)
+            colour, pattern = self.draws.surface("brick", CLAY_RED, 0)
+            clay = mottled(colour, contrast=0.12, size=512, seed=pattern)
             # SAPIEN unfolds a box on its texture as a cross of 3 x 4 faces: 2 x 5 holes a face.
             bed = perforated(clay, rows=3 * 2, columns=4 * 5, radius=0.28)
             builder.add_box_visual(pose, half_size, material=textured(clay))

@@ -1,0 +1,70 @@
+"""The axes along which any task can be perturbed, and their levels. Standard library only.
+
+Level 0 is the task as it is. What is drawn once (camera, light, textures, size, distractors) follows from the axis
+and a seed alone; what it draws every episode (initial pose, sensor noise) from the episode's own seed.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One thing that can be perturbed.
+
+    Args:
+        unit: what a level's number is.
+        levels: the numbers of levels 1, 2, ...
+    """
+
+    unit: str
+    levels: tuple[float, ...]
+
+
+AXES = {
+    "camera": Axis("metres between the fixed camera's eye and its nominal place", (0.02, 0.05, 0.10)),
+    "light": Axis("relative change of the lights' brightness, and of their direction", (0.2, 0.4, 0.6)),
+    "texture": Axis("relative change of the brick's and the ground's colour, with another pattern", (0.1, 0.2, 0.4)),
+    "size": Axis("factor of the square root of a brick's dimension: EN 771-1's categories T2 and T1", (0.25, 0.40)),
+    "distractors": Axis("loose offcuts beside the work", (1, 2, 4)),
+    "pose": Axis("standard deviation of the robot's initial joint angles in radians", (0.01, 0.02, 0.04)),
+    "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16)),
+}
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """Which axes are perturbed, how far, and by which draw.
+
+    Args:
+        levels: `axis=level` with commas between, such as `camera=2,light=1`; empty for none.
+        seed: of what is drawn once.
+
+    Raises:
+        ValueError: an axis, or a level of it, that does not exist.
+    """
+
+    levels: str = ""
+    seed: int = 0
+
+    def __post_init__(self):
+        for name, level in self._pairs():
+            if name not in AXES:
+                raise ValueError(f"Unknown perturbation '{name}'; the axes are: {', '.join(AXES)}.")
+            highest = len(AXES[name].levels)
+            if not level.isdecimal() or int(level) > highest:
+                raise ValueError(f"The level of '{name}' must be 0 to {highest}, not '{level}'.")
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]
+        return [(name.strip(), level.strip()) for name, _, level in parts]
+
+    def amount(self, axis: str) -> float:
+        """The number of the level at which `axis` is perturbed, in the axis's unit; 0 where it is not."""
+        level = int(dict(self._pairs()).get(axis, 0))
+        return AXES[axis].levels[level - 1] if level else 0.0
+
+    @property
+    def label(self) -> str:
+        """How results are marked: empty without a perturbation, else such as `+camera=2+light=1+seed=0`."""
+        named = [f"+{name}={level}" for name, level in self._pairs() if level != "0"]
+        return "".join([*named, f"+seed={self.seed}"]) if named else ""
