@@ -1,6 +1,6 @@
 """Experts and noise: pure functions, checked as such, and experts that must succeed on the real simulator."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import draccus
@@ -71,6 +71,17 @@ def test_the_lift_is_the_papers_or_as_high_as_the_arm_reaches(x, height):
     held = state(tcp_pose=[x, 0, 0.08, 0, 1, 0, 0])
     target = expert._target(held, Progress(Phase.LIFT, 0, held.tcp))
     np.testing.assert_allclose(target - held.tcp, [0, 0, height], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "mass, up", [(1.3649998, "0x1.8c6a8cp-5"), (1.3650001, "0x1.8c6a8ep-5"), (1.3650012, "0x1.8c6a94p-5")]
+)
+def test_the_paper_tasks_lift_is_rounded_as_in_the_data_sets_that_exist(mass, up):
+    """Each value is the first release's; another order of the same multiplication gives another last bit."""
+    held = state(tcp_pose=[0, 0, 0.17, 0, 1, 0, 0])
+    held = replace(held, tcp_pose=held.tcp_pose.astype(np.float32), object_mass=np.array([mass], np.float32))
+    action, *_ = make_expert(TASKS["brick_to_bin"], ExpertConfig()).act(held, Progress(Phase.LIFT, 0, held.tcp))
+    assert action[2] == float.fromhex(up)
 
 
 @pytest.mark.parametrize(
