@@ -13,8 +13,9 @@ setup: ## make .venv/ and install what it needs from the system
 demo: setup ## demonstrations, training, evaluation and a video, end to end
 	@examples/demo.sh
 
-ten-seeds: setup ## ten training seeds of frozen_vit on the fast set, lift and place counts per seed
-	@SEEDS="0 1 2 3 4 5 6 7 8 9" examples/demo.sh
+ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study, with its report
+	.venv/bin/constructskill-study --config_path=configs/study/ten_seeds.yaml
+	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
 
 test: setup ## every test
 	@./setup.sh browser

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The brick task from end to end: demonstrations, one pass of the frozen encoder, lerobot-train and lerobot-eval per
 # training seed, and the outcomes. Every step is a command of the README. A finished step is not done again, so a run
-# that was killed continues; `make ten-seeds` continues `make demo`.
+# that was killed continues.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH"

@@ -1,6 +1,10 @@
 """Runs a study: what is missing is executed, what is finished is kept, and its table is always whole."""
 
 import fcntl
+import json
+import os
+import platform
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +24,7 @@ from lerobot_constructskill.study.plan import Run, StudyPlan
 from lerobot_constructskill.study.prepare import Store
 from lerobot_constructskill.study.rows import Row, merge_rows, read_rows, write_rows
 
-PLAN, ROWS = "plan.yaml", "rows.parquet"
+PLAN, ROWS, PROVENANCE = "plan.yaml", "rows.parquet", "provenance.json"
 
 
 @dataclass(frozen=True)
@@ -51,6 +55,7 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
     """
     with _claimed(root):
         _write_plan(plan, root)
+        start = time.monotonic()
         runs = [*plan.reference_runs, *plan.runs]
         finished = [run for run in runs if _is_finished(root, run, options)]
         with tqdm(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
@@ -60,6 +65,7 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
                 progress.update()
                 progress.set_postfix_str(run.id)
         _merge(root, runs)
+        _write_provenance(root, time.monotonic() - start)
         return read_rows(root / ROWS)
 
 
@@ -122,3 +128,12 @@ def _is_finished(root: Path, run: Run, options: Options) -> bool:
 def _merge(root: Path, runs: list[Run]) -> None:
     """Put the rows there are into the study's table, in the plan's order."""
     merge_rows(filter(Path.exists, (_row_file(root, run) for run in runs)), root / ROWS)
+
+
+def _write_provenance(root: Path, seconds: float) -> None:
+    """Say where the study ran, and for how long in all; a study that was interrupted adds up."""
+    path = root / PROVENANCE
+    before = json.loads(path.read_text())["wall time, s"] if path.exists() else 0
+    facts = {"wall time, s": round(before + seconds), "cores": os.cpu_count(), "machine": platform.machine()}
+    with replaced(path) as partial:
+        partial.write_text(json.dumps(facts, indent=2) + "\n")

@@ -98,7 +98,7 @@ def test_a_failing_agent_is_recorded_and_the_others_go_on():
 
 def step(**info):
     state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
-    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_placed": False} | info)
+    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False} | info)
 
 
 def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
