@@ -1,7 +1,7 @@
 """How each stage grows with the number of demonstrations: seconds for each further one, and peak memory.
 
-Generation is measured on real demonstrations, few of them. Merging, encoding and training are measured on up to 1280:
-copies of one for merging, and short ones of random colours for encoding, with the small encoder and random weights.
+Generation is measured on real demonstrations, few of them, and merging on copies of one, half a second each. Encoding
+and training are measured on up to 1280, short ones of random colours, with the small encoder and random weights.
 What is measured is how the cost grows, not what it is.
 """
 
@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 
-GENERATED, DEMONSTRATIONS = (4, 12, 36), (80, 320, 1280)
+GENERATED, MERGED, DEMONSTRATIONS = (4, 12, 36), (10, 40, 160), (80, 320, 1280)
 LENGTH, SHAPE = 20, (224, 224, 3)
 WEIGHTS = OUT / "vit_tiny16.safetensors"
 
@@ -68,7 +68,7 @@ def training(count: int) -> Ran:
     return run("python", "benchmarks/ten_seeds.py", str(OUT / "scaling" / str(count)), "10", "256", str(WEIGHTS))
 
 
-STAGES = {generation: GENERATED, merging: DEMONSTRATIONS, encoding: DEMONSTRATIONS, training: DEMONSTRATIONS}
+STAGES = {generation: GENERATED, merging: MERGED, encoding: DEMONSTRATIONS, training: DEMONSTRATIONS}
 
 
 def main() -> None:

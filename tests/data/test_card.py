@@ -82,6 +82,7 @@ def test_the_modality_covers_every_channel_once(task, obs_type):
     assert {video["original_key"] for video in parts["video"].values()} == {n for n in features if "images" in n}
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_card_with_its_pictures(copy, tmp_path):
     command = [sys.executable, "-m", "lerobot_constructskill.scripts.card", f"--root={copy}", "--repo_id=alice/toy"]
     done = subprocess.run([*command, f"--facts={tmp_path / 'facts.json'}"], capture_output=True, text=True)

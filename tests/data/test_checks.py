@@ -216,6 +216,7 @@ def check(*flags):
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_line_for_each_check_and_tells_by_its_status(pristine, copy):
     good = check(f"--root={pristine}")
     assert good.returncode == 0 and "9 demonstrations, 1108 frames: 13 checks, nothing wrong." in good.stdout

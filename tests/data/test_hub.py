@@ -59,6 +59,7 @@ def refusal(call, *arguments, **options):
     return str(error.value)
 
 
+@pytest.mark.slow
 def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy):
     url = machine(push_dataset, PushConfig("alice/toy", copy, private=True, tag="v1.0"))
     repo = hub.repos["datasets/alice/toy"]
@@ -71,6 +72,7 @@ def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine
     assert all(TOKEN.encode() not in content for content in hub.blobs.values())
 
 
+@pytest.mark.slow
 def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine):
     hub.blobs.clear()
     hub.uploads.clear()

@@ -1,5 +1,6 @@
 """Merging in groups of groups, which keeps the cost of many demonstrations linear, changes no frame."""
 
+import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from toy import record_toy
@@ -7,6 +8,7 @@ from toy import record_toy
 from lerobot_constructskill.demos import merge
 
 
+@pytest.mark.slow
 def test_groups_of_groups_hold_the_same_frames_in_the_same_order(pristine, tmp_path, monkeypatch):
     monkeypatch.setattr(merge, "GROUP", 2)  # nine demonstrations: five groups, three, two, one
     record_toy(tmp_path / "grouped", episodes=9)

@@ -88,7 +88,7 @@ def test_selections_that_no_policy_could_be_asked_are_refused(task, word):
 
 def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with():
     actions = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 4)).astype(np.float32)
-    sent = np.array([ConstructSkillEnv()._maniskill_action(action)[:3] for action in actions])
+    sent = np.array([ConstructSkillEnv().maniskill_action(action)[:3] for action in actions])
     np.testing.assert_array_equal(sent, actions[:, :3] / np.float32(ACTION_SCALE))
 
 

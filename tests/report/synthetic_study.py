@@ -29,7 +29,7 @@ PLAN = StudyPlan(
         "no_chunk": Variant(policy=VIT, seeds=3, label="No action chunking"),
         "noise_free": Variant(policy=VIT, seeds=3, label="No noise injection"),
     },
-    references=["no_op", "random", "replay", "blind", "expert"],
+    references={"no_op": 1, "random": 10, "replay": 10, "blind": 10, "expert": 1},
 )
 
 # Variant: (chance that a seed lifts, that a lifting seed places, held-out error in m2).
