@@ -29,7 +29,7 @@ ARROWS = {
     "demos.recorder": ("contract", "pools", "staging"),
     "data": ("contract", "demos"),
     "data.replay": ("contract", "demos", "envs"),
-    "features": ("contract", "policies"),
+    "features": ("contract", "policies", "staging"),
     "study": (),
     "study.plan": ("contract",),
     "study.rows": ("staging",),

@@ -1,6 +1,7 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
 import hashlib
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,13 +17,19 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
+from lerobot_constructskill.staging import replaced
 
-PATCHES = "patch_features.npy"
+PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
+
+PARTS = "encoded"
+"""Folder for finished episodes, beside the feature set in the making."""
+
+PATCHES = ".patches.npy"
 
 
 def load_encoder(
@@ -45,11 +52,17 @@ def load_encoder(
 
 
 def encode_frames(
-    dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int, patches: Path | None = None
+    dataset: LeRobotDataset,
+    camera: str,
+    encoder: FrozenEncoder,
+    batch_size: int,
+    parts: Path,
+    patches: Path | None = None,
 ) -> np.ndarray:
     """Encode every frame of one camera, in the order of the data set.
 
     Args:
+        parts: folder for the features of finished episodes; those that lie there already are not encoded again.
         patches: file to write the patch features to as well, a NumPy array (N, P, D) float16.
 
     Returns:
@@ -62,23 +75,50 @@ def encode_frames(
     if key not in dataset.meta.camera_keys:
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
         raise ValueError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
-    device = next(encoder.parameters()).device
-    spec, n_frames = encoder.spec, dataset.num_frames
-    features = np.empty((n_frames, spec.feature_dim), dtype=np.float32)
+    with tqdm(total=dataset.num_frames, unit="frame", desc=f"Encoding {camera}") as progress:
+        for episode in dataset.meta.episodes:
+            file = _part(parts, episode)
+            if not file.exists():
+                images = _batches(dataset, key, episode, batch_size)
+                pooled, tokens = zip(*(_encode(encoder, batch, patches is not None) for batch in images), strict=True)
+                if patches is not None:
+                    _save(file.with_suffix(PATCHES), np.concatenate(tokens))
+                _save(file, np.concatenate(pooled))  # last: it says that the episode is finished
+            progress.update(episode["length"])
     if patches is not None:
-        shape = (n_frames, spec.n_patches, spec.feature_dim)
-        patch_map = np.lib.format.open_memmap(patches, "w+", dtype=np.float16, shape=shape)
-    done = 0
-    with tqdm(total=n_frames, unit="frame", desc=f"Encoding {camera}") as progress:
-        for images in _batches(dataset, key, batch_size):
-            rows = slice(done, done + len(images))
-            pooled, tokens = encoder.encode(images.to(device) / 255)
-            features[rows] = pooled.cpu().numpy()
-            if patches is not None:
-                patch_map[rows] = tokens.cpu().numpy()
-            done = rows.stop
-            progress.update(len(images))
-    return features
+        _join_patches(dataset, parts, encoder.spec, patches)
+    return np.concatenate([np.load(_part(parts, episode)) for episode in dataset.meta.episodes])
+
+
+def parts_folder(folder: Path, dataset: LeRobotDataset, camera: str, info: dict[str, str], patches: bool) -> Path:
+    """Where the parts of a feature set lie that is being written to `folder`, a path that `staged` gave.
+
+    Nothing that was made otherwise is ever taken for a part: what they are made of is in the folder's name.
+    """
+    made_of = {**info, "camera": camera, "source": data_sha256(dataset.root), "patches": patches}
+    return folder.with_name(PARTS) / hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _part(parts: Path, episode: dict) -> Path:
+    return parts / f"{episode['episode_index']}.npy"
+
+
+def _encode(encoder: FrozenEncoder, images: Tensor, with_patches: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    pooled, tokens = encoder.encode(images.to(encoder.mean.device) / 255)
+    return pooled.cpu().numpy(), tokens.cpu().numpy().astype(np.float16) if with_patches else None
+
+
+def _save(file: Path, array: np.ndarray) -> None:
+    with replaced(file) as partial:
+        np.save(partial, array)
+
+
+def _join_patches(dataset: LeRobotDataset, parts: Path, spec: Backbone, file: Path) -> None:
+    shape = (dataset.num_frames, spec.n_patches, spec.feature_dim)
+    joined = np.lib.format.open_memmap(file, "w+", dtype=np.float16, shape=shape)
+    for episode in dataset.meta.episodes:
+        rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
+        joined[rows] = np.load(_part(parts, episode).with_suffix(PATCHES))
 
 
 def write_feature_set(
@@ -114,19 +154,18 @@ def data_sha256(root: Path) -> str:
     return digest.hexdigest()
 
 
-def _batches(dataset: LeRobotDataset, key: str, batch_size: int) -> Iterator[Tensor]:
-    """Yield (B, 3, H, W) images in [0, 255], episode by episode, so that a video is decoded front to back."""
-    for episode in dataset.meta.episodes:
-        start, stop = episode["dataset_from_index"], episode["dataset_to_index"]
-        for first in range(start, stop, batch_size):
-            rows = range(first, min(first + batch_size, stop))
-            if key in dataset.meta.video_keys:
-                offset = episode[f"videos/{key}/from_timestamp"]
-                times = [offset + (row - start) / dataset.fps for row in rows]
-                path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], key)
-                yield decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
-            else:
-                yield torch.stack(dataset.hf_dataset[list(rows)][key]) * 255
+def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) -> Iterator[Tensor]:
+    """Yield an episode's (B, 3, H, W) images in [0, 255], so that a video is decoded front to back."""
+    start, stop = episode["dataset_from_index"], episode["dataset_to_index"]
+    for first in range(start, stop, batch_size):
+        rows = range(first, min(first + batch_size, stop))
+        if key in dataset.meta.video_keys:
+            offset = episode[f"videos/{key}/from_timestamp"]
+            times = [offset + (row - start) / dataset.fps for row in rows]
+            path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], key)
+            yield decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
+        else:
+            yield torch.stack(dataset.hf_dataset[list(rows)][key]) * 255
 
 
 def _forget_videos(root: Path) -> None:

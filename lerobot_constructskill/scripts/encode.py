@@ -29,7 +29,7 @@ class EncodeConfig:
 
 
 def encode(config: EncodeConfig) -> Path:
-    """Encode a data set and return the folder of the feature set.
+    """Encode a data set and return the folder of the feature set; a killed run continues with its next episode.
 
     Raises:
         ValueError: unknown backbone, precision or camera, or damaged weights.
@@ -41,21 +41,29 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
-    from lerobot_constructskill.features.encode import PATCHES, encode_frames, load_encoder, write_feature_set
+    from lerobot_constructskill.features.encode import (
+        PARTS,
+        PATCHES_FILE,
+        encode_frames,
+        load_encoder,
+        parts_folder,
+        write_feature_set,
+    )
 
     if config.batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
-    with staged(out_root) as folder:
+    with staged(out_root, keep=PARTS) as folder:
         encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
         encoder.to(config.device or auto_select_torch_device())
         dataset = LeRobotDataset(config.repo_id, root=config.root)
-        patches = folder.with_name(PATCHES) if config.patches else None  # LeRobot wants to make the folder itself
-        features = encode_frames(dataset, config.camera, encoder, config.batch_size, patches)
+        parts = parts_folder(folder, dataset, config.camera, info, config.patches)
+        patches = folder.with_name(PATCHES_FILE) if config.patches else None  # LeRobot makes the folder itself
+        features = encode_frames(dataset, config.camera, encoder, config.batch_size, parts, patches)
         write_feature_set(dataset, config.camera, features, info, out_repo_id, folder)
         if patches is not None:
-            patches.rename(folder / PATCHES)
+            patches.rename(folder / PATCHES_FILE)
     return out_root
 
 

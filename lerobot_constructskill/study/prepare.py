@@ -15,7 +15,14 @@ from safetensors.torch import save_file
 
 from lerobot_constructskill.demos.recorder import record
 from lerobot_constructskill.demos.settings import GenerateConfig, provenance
-from lerobot_constructskill.features.encode import data_sha256, encode_frames, load_encoder, write_feature_set
+from lerobot_constructskill.features.encode import (
+    PARTS,
+    data_sha256,
+    encode_frames,
+    load_encoder,
+    parts_folder,
+    write_feature_set,
+)
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.staging import replaced, staged
@@ -80,9 +87,12 @@ class Store:
         root = self.root / f"{demonstrations.root.name}-features-{_digest(made_of)}"
         repo_id = f"{demonstrations.repo_id}_{info['backbone']}"
         if not root.exists():
-            with staged(root) as folder:
-                encode = _encode_grey if blind else encode_frames
-                features = encode(demonstrations, camera, encoder, ENCODE_BATCH)
+            with staged(root, keep=PARTS) as folder:
+                if blind:
+                    features = _encode_grey(demonstrations, encoder)
+                else:
+                    parts = parts_folder(folder, demonstrations, camera, info, patches=False)
+                    features = encode_frames(demonstrations, camera, encoder, ENCODE_BATCH, parts)
                 write_feature_set(demonstrations, camera, features, info, repo_id, folder)
         return LeRobotDataset(repo_id, root=root)
 
@@ -96,7 +106,7 @@ class Store:
         return path
 
 
-def _encode_grey(demonstrations: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int) -> np.ndarray:
+def _encode_grey(demonstrations: LeRobotDataset, encoder: FrozenEncoder) -> np.ndarray:
     feature = encoder(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY))
     return feature.expand(demonstrations.num_frames, -1).numpy().copy()
 

@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.features import encode as features_encode
-from lerobot_constructskill.features.encode import PATCHES, load_encoder
+from lerobot_constructskill.features.encode import PATCHES_FILE, load_encoder
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -125,7 +125,7 @@ def test_features_are_the_policys_own_at_every_frame(source, encoded, weights):
 
 def test_patch_features_on_request(source, weights, tmp_path):
     encode(settings(source, weights, tmp_path / "out", patches=True))
-    patches = np.load(tmp_path / "out" / PATCHES, mmap_mode="r")
+    patches = np.load(tmp_path / "out" / PATCHES_FILE, mmap_mode="r")
     encoder, _ = load_encoder("vit_tiny16", str(weights))
     _, expected = encoder.encode(torch.stack([frame["observation.images.base"] for frame in source]))
     assert patches.shape == (sum(LENGTHS), 196, 192) and patches.dtype == np.float16
@@ -187,6 +187,31 @@ def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, mon
     monkeypatch.setattr(weights_module, "_in_wheel", lambda backbone: False)
     with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
         make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
+
+
+@pytest.mark.parametrize("patches", [False, True])
+def test_an_interrupted_run_continues_with_its_next_episode(patches, source, weights, encoded, tmp_path, monkeypatch):
+    encoder = features_encode._encode
+    seen = []
+
+    def interrupted(of, images, with_patches):
+        seen.append(len(images))
+        if sum(seen) > LENGTHS[0] + 2:
+            raise KeyboardInterrupt
+        return encoder(of, images, with_patches)
+
+    monkeypatch.setattr(features_encode, "_encode", interrupted)
+    config = settings(source, weights, tmp_path / "out", patches=patches)
+    with pytest.raises(KeyboardInterrupt):
+        encode(config)
+    assert not (tmp_path / "out").exists()
+    seen.clear()
+    monkeypatch.setattr(features_encode, "_encode", lambda *args: (seen.append(len(args[1])), encoder(*args))[1])
+    encode(config)
+    assert sum(seen) == LENGTHS[1] and not (tmp_path / "out.partial").exists()
+    for before, after in zip(encoded, LeRobotDataset("local/out", root=tmp_path / "out"), strict=True):
+        assert torch.equal(before[KEY], after[KEY])
+    assert (tmp_path / "out" / PATCHES_FILE).exists() == patches
 
 
 @pytest.mark.parametrize("fields", [{"backbone": "resnet18"}, {"camera": "top"}, {"batch_size": 0}])
