@@ -57,10 +57,9 @@ def test_lockstep_equals_lerobot_eval_step_for_step(fields, config, vector):
         pytest.importorskip("openvino", reason="autocast's features depend on the batch")
     agents = [random_agent(config, seed, **fields) for seed in range(2)]
     seen = {}
-    outcomes = roll_out(
-        agents, ENV, SEEDS, on_step=lambda i, episode, a, _: seen.setdefault((i, episode), []).append(a)
-    )
-    assert all(len(outcome.episodes) == 2 and outcome.error is None for outcome in outcomes)
+    keep = lambda i, episode, action, _: seen.setdefault((i, episode), []).append(action)  # noqa: E731
+    outcomes = dict(roll_out(agents, ENV, SEEDS, on_step=keep))
+    assert all(len(outcome.episodes) == 2 and outcome.error is None for outcome in outcomes.values())
     assert len({id(agent.encoder) for agent in agents}) == 1
     for (i, episode), actions in seen.items():
         np.testing.assert_array_equal(actions, lerobots_actions(agents[i], vector, SEEDS[episode]))

@@ -35,7 +35,7 @@ def plan_file(tmp_path_factory, tiny_weights):
         "settings": {
             "fixed": {
                 "data": str(REPOSITORY / "configs/generate/smoke.yaml"),
-                "env": {"task": "brick_to_bin", "episode_length": 8},
+                "env": {"task": "brick_to_bin", "episode_length": 8, "obs_type": "pixels_agent_pos"},
             }
         },
         "variants": {
@@ -48,7 +48,7 @@ def plan_file(tmp_path_factory, tiny_weights):
         "episodes": 2,
     }
     file = tmp_path_factory.mktemp("plan") / "tiny.yaml"
-    file.write_text(yaml.safe_dump(plan))
+    file.write_text(yaml.safe_dump(plan, sort_keys=False))
     return file
 
 
@@ -88,6 +88,7 @@ def test_killed_at_any_stage_it_ends_as_the_undisturbed_one(plan_file, undisturb
 @pytest.mark.slow
 def test_the_rows_say_what_happened(undisturbed):
     finished = undisturbed[undisturbed["error"].isna()]
+    assert set(undisturbed["variant"]) - set(finished["variant"]) == {"absent"}, list(undisturbed["error"].dropna())
     counts = finished.groupby("variant").size().to_dict()
     assert counts == {"tiny": 4, "act": 2, "no_op": 2, "random": 4, "replay": 2, "blind": 2, "expert": 2}
     assert set(finished["steps"]) == {8} and set(finished["evaluation_seed"]) == {1000, 1001}
