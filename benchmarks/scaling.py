@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 
-GENERATED, MERGED, DEMONSTRATIONS = (4, 12, 36), (10, 40, 160), (80, 320, 1280)
-LENGTH, SHAPE = 20, (224, 224, 3)
+GENERATED, MERGED, DEMONSTRATIONS = (4, 12, 24), (10, 40, 120), (80, 320, 1280)
+LENGTH, SHAPE = 5, (224, 224, 3)
 WEIGHTS = OUT / "vit_tiny16.safetensors"
 
 
@@ -68,7 +68,7 @@ def training(count: int) -> Ran:
     return run("python", "benchmarks/ten_seeds.py", str(OUT / "scaling" / str(count)), "10", "256", str(WEIGHTS))
 
 
-STAGES = {generation: GENERATED, merging: MERGED, encoding: DEMONSTRATIONS, training: DEMONSTRATIONS}
+STAGES = {encoding: DEMONSTRATIONS, training: DEMONSTRATIONS, merging: MERGED, generation: GENERATED}
 
 
 def main() -> None:
