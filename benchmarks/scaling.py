@@ -15,8 +15,8 @@ from safetensors.torch import save_file
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 
-GENERATED, MERGED, DEMONSTRATIONS = (4, 12, 24), (10, 40, 120), (80, 320, 1280)
-LENGTH, SHAPE = 5, (224, 224, 3)
+GENERATED, MERGED, DEMONSTRATIONS = (4, 12, 36), (10, 40, 160), (80, 320, 1280)
+LENGTH, SHAPE = 20, (224, 224, 3)
 WEIGHTS = OUT / "vit_tiny16.safetensors"
 
 
