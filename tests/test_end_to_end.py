@@ -78,15 +78,16 @@ def test_training_reports_the_held_out_error_in_square_metres(trained, features)
 
 
 def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reaches(features, folder):
-    """Sixty steps, twenty passes; only the order of the samples differs."""
+    """Sixty steps, fifteen passes. Its samples come in another order, so it is one more draw from what seeds give."""
     recipe = ["--steps=60", "--eval_steps=60", "--batch_size=70", "--num_workers=0", "--save_freq=60", "--seed=0"]
     flags = ["--policy.type=frozen_vit", "--policy.push_to_hub=false", *features, *HOLD_OUT, *recipe]
     log = call("lerobot-train", *flags, "--env_eval_freq=0", f"--output_dir={folder / 'sixty'}")
     theirs = float(log.split("heldout_translation_mse_m2=")[1].split()[0])
     root, repo_id = (flag.split("=")[1] for flag in features)
     dataset, config = LeRobotDataset(repo_id, root=root), FrozenViTChunkConfig(device="cpu")
-    (ours,) = train_seeds(config, dataset, [0], Training(epochs=20, batch_size=70, holdout=2))
-    assert ours.heldout_mse_m2 == pytest.approx(theirs, rel=0.1)
+    ours = [one.heldout_mse_m2 for one in train_seeds(config, dataset, range(20), Training(15, 70, holdout=2))]
+    middle, spread = np.mean(ours), np.std(ours, ddof=1)
+    assert abs(theirs - middle) < 4 * spread < middle, (theirs, ours)
 
 
 def test_training_held_out_the_named_episode_and_no_other(features):
