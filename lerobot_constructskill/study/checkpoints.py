@@ -14,6 +14,7 @@ from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import 
 from lerobot_constructskill.staging import staged
 from lerobot_constructskill.study.plan import Run, StudyPlan, Training
 from lerobot_constructskill.study.prepare import Store
+from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.study.train import save_checkpoint, train_seeds
 
 TRAINED = ("blind", "untrained")
@@ -58,7 +59,8 @@ class Job:
 
 
 def demonstrations(job: Job) -> LeRobotDataset:
-    return job.store.demonstrations(job.data)
+    with timed(job.root, "demonstrations"):
+        return job.store.demonstrations(job.data)
 
 
 def heldout_error(job: Job, run: Run) -> float | None:
@@ -85,10 +87,13 @@ def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training:
     reference = runs[0].variant if runs[0].is_reference else None
     if reference == "untrained":
         policy["backbone_path"] = str(job.store.untrained_weights(policy.get("backbone", "dinov2_vits14")))
-    features = job.store.features(demonstrations(job), policy, blind=reference == "blind")
+    dataset = demonstrations(job)
+    with timed(job.root, "encoding"):
+        features = job.store.features(dataset, policy, blind=reference == "blind")
     fields = {name: value for name, value in policy.items() if name != "type"}
     config = draccus.decode(FrozenViTChunkConfig, fields | {"save_backbone": False, "push_to_hub": False})
-    trained = train_seeds(config, features, [run.seed for run in runs], training)
+    with timed(job.root, "training"):
+        trained = train_seeds(config, features, [run.seed for run in runs], training)
     for run, one in zip(runs, trained, strict=True):
         with staged(job.folder(run)) as folder:
             save_checkpoint(one.policy, features, folder / job.checkpoint(run).name)
@@ -116,7 +121,8 @@ def _train_stock(job: Job, run: Run, policy: dict[str, Any], training: Training)
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]
-        done = subprocess.run(command, capture_output=True, text=True)
+        with timed(job.root, "training"):
+            done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"lerobot-train failed: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
         last = (folder / "checkpoints" / "last" / "pretrained_model").resolve()

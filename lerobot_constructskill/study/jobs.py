@@ -14,6 +14,7 @@ from lerobot_constructskill.study.plan import Run
 from lerobot_constructskill.study.references import Blind, Expert, NoOp, Random, Replay
 from lerobot_constructskill.study.rollout import Outcome, roll_out
 from lerobot_constructskill.study.rows import Row
+from lerobot_constructskill.study.timing import timed
 
 PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "transformers", "numpy")
 
@@ -30,10 +31,11 @@ def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
         return
     seeds = range(job.plan.eval_seed, job.plan.eval_seed + job.plan.episodes)
     film = Film()
-    for i, outcome in roll_out(agents, job.env, seeds, on_step=film.add):
-        run = job.runs[i]
-        video = film.write(job.root, run)
-        yield run, _finished(job, run, outcome, video) if outcome.error is None else [_failed(job, run, outcome.error)]
+    with timed(job.root, "evaluation"):
+        for i, outcome in roll_out(agents, job.env, seeds, on_step=film.add):
+            run, failed = job.runs[i], outcome.error
+            video = film.write(job.root, run)
+            yield run, _finished(job, run, outcome, video) if failed is None else [_failed(job, run, failed)]
 
 
 def _agents(job: Job) -> list[Agent]:

@@ -23,6 +23,7 @@ from lerobot_constructskill.study.jobs import execute
 from lerobot_constructskill.study.plan import Run, StudyPlan
 from lerobot_constructskill.study.prepare import Store
 from lerobot_constructskill.study.rows import Row, merge_rows, read_rows, write_rows
+from lerobot_constructskill.study.timing import seconds_by_stage
 
 PLAN, ROWS, PROVENANCE = "plan.yaml", "rows.parquet", "provenance.json"
 
@@ -130,10 +131,18 @@ def _merge(root: Path, runs: list[Run]) -> None:
     merge_rows(filter(Path.exists, (_row_file(root, run) for run in runs)), root / ROWS)
 
 
+def _processor() -> str:
+    """The processor's name, which Linux keeps where Python does not look."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
+
+
 def _write_provenance(root: Path, seconds: float) -> None:
     """Say where the study ran, and for how long in all; a study that was interrupted adds up."""
     path = root / PROVENANCE
     before = json.loads(path.read_text())["wall time, s"] if path.exists() else 0
-    facts = {"wall time, s": round(before + seconds), "cores": os.cpu_count(), "machine": platform.machine()}
+    stages = {f"of which {stage}, s": round(total) for stage, total in seconds_by_stage(root).items()}
+    facts = {"wall time, s": round(before + seconds), **stages, "machine": f"{os.cpu_count()} cores, {_processor()}"}
     with replaced(path) as partial:
         partial.write_text(json.dumps(facts, indent=2) + "\n")
