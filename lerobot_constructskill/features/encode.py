@@ -19,12 +19,9 @@ from tqdm import tqdm
 
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.staging import replaced
-
-PATCHES_FILE = "patch_features.npy"
-"""Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
 
 PARTS = "encoded"
 """Folder for finished episodes, beside the feature set in the making."""
@@ -51,26 +48,40 @@ def load_encoder(
     return encoder, {**describe(spec, state_sha256(state), precision), **made}
 
 
-def encode_frames(
+def write_feature_set(
     dataset: LeRobotDataset,
     camera: str,
     encoder: FrozenEncoder,
-    batch_size: int,
-    parts: Path,
-    patches: Path | None = None,
-) -> np.ndarray:
-    """Encode every frame of one camera, in the order of the data set.
+    info: dict[str, str],
+    repo_id: str,
+    folder: Path,
+    batch_size: int = 16,
+    patches: bool = False,
+) -> None:
+    """Write a copy of `dataset` with the pooled features of one camera, (N, D) float32, in place of its images.
+
+    Indices, episodes, tasks, actions and other observations stay as they are; columns that no policy reads are left
+    out, because LeRobot's loader takes time for each.
 
     Args:
-        parts: folder for the features of finished episodes; those that lie there already are not encoded again.
-        patches: file to write the patch features to as well, a NumPy array (N, P, D) float16.
-
-    Returns:
-        (N, D) float32
+        encoder: what encodes, and with `info` its description, as `load_encoder` returns them.
+        folder: where to, a path that `staged` gave; episodes that a killed run finished are not encoded again.
+        patches: whether to write every patch's feature as well, to `PATCHES_FILE`.
 
     Raises:
         ValueError: the data set has no such camera.
     """
+    parts = _parts_folder(folder, dataset, camera, {**info, "encoder": type(encoder).__name__}, patches)
+    features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
+    _write_copy(dataset, camera, features, info, repo_id, folder)
+    if patches:
+        _join_patches(dataset, parts, encoder.spec, folder / PATCHES_FILE)
+
+
+def _encode_frames(
+    dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int, parts: Path, patches: bool
+) -> np.ndarray:
+    """Encode every frame of one camera to (N, D) float32, in the order of the data set, by way of `parts`."""
     key = f"observation.images.{camera}"
     if key not in dataset.meta.camera_keys:
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
@@ -80,18 +91,16 @@ def encode_frames(
             file = _part(parts, episode)
             if not file.exists():
                 images = _batches(dataset, key, episode, batch_size)
-                pooled, tokens = zip(*(_encode(encoder, batch, patches is not None) for batch in images), strict=True)
-                if patches is not None:
+                pooled, tokens = zip(*(_encode(encoder, batch, patches) for batch in images), strict=True)
+                if patches:
                     _save(file.with_suffix(PATCHES), np.concatenate(tokens))
                 _save(file, np.concatenate(pooled))  # last: it says that the episode is finished
             progress.update(episode["length"])
-    if patches is not None:
-        _join_patches(dataset, parts, encoder.spec, patches)
     return np.concatenate([np.load(_part(parts, episode)) for episode in dataset.meta.episodes])
 
 
-def parts_folder(folder: Path, dataset: LeRobotDataset, camera: str, info: dict[str, str], patches: bool) -> Path:
-    """Where the parts of a feature set lie that is being written to `folder`, a path that `staged` gave.
+def _parts_folder(folder: Path, dataset: LeRobotDataset, camera: str, info: dict[str, str], patches: bool) -> Path:
+    """Where the finished episodes of a feature set lie that is being written to `folder`.
 
     Nothing that was made otherwise is ever taken for a part: what they are made of is in the folder's name.
     """
@@ -104,7 +113,7 @@ def _part(parts: Path, episode: dict) -> Path:
 
 
 def _encode(encoder: FrozenEncoder, images: Tensor, with_patches: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    pooled, tokens = encoder.encode(images.to(encoder.mean.device) / 255)
+    pooled, tokens = encoder.encode(images.to(encoder.device) / 255)
     return pooled.cpu().numpy(), tokens.cpu().numpy().astype(np.float16) if with_patches else None
 
 
@@ -121,14 +130,9 @@ def _join_patches(dataset: LeRobotDataset, parts: Path, spec: Backbone, file: Pa
         joined[rows] = np.load(_part(parts, episode).with_suffix(PATCHES))
 
 
-def write_feature_set(
+def _write_copy(
     dataset: LeRobotDataset, camera: str, features: np.ndarray, info: dict[str, str], repo_id: str, folder: Path
 ) -> None:
-    """Write a copy of `dataset` with `features` (N, D) in place of its images.
-
-    Indices, episodes, tasks, actions and other observations stay as they are; columns that no policy reads are left
-    out, because LeRobot's loader takes time for each.
-    """
     key = feature_key(camera)
     info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
     column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}

@@ -41,14 +41,7 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
-    from lerobot_constructskill.features.encode import (
-        PARTS,
-        PATCHES_FILE,
-        encode_frames,
-        load_encoder,
-        parts_folder,
-        write_feature_set,
-    )
+    from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
     if config.batch_size < 1:
         raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
@@ -58,12 +51,8 @@ def encode(config: EncodeConfig) -> Path:
         encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
         encoder.to(config.device or auto_select_torch_device())
         dataset = LeRobotDataset(config.repo_id, root=config.root)
-        parts = parts_folder(folder, dataset, config.camera, info, config.patches)
-        patches = folder.with_name(PATCHES_FILE) if config.patches else None  # LeRobot makes the folder itself
-        features = encode_frames(dataset, config.camera, encoder, config.batch_size, parts, patches)
-        write_feature_set(dataset, config.camera, features, info, out_repo_id, folder)
-        if patches is not None:
-            patches.rename(folder / PATCHES_FILE)
+        made = dataset, config.camera, encoder, info, out_repo_id, folder
+        write_feature_set(*made, config.batch_size, config.patches)
     return out_root
 
 

@@ -14,7 +14,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED, FrozenViTChunkPolicy
 
 
 @dataclass(frozen=True)
@@ -25,20 +25,20 @@ class Observation:
         seen: the environment's observation.
         sim: privileged state, `contract.SIM_STATE` name to float32 array; for experts alone.
         instruction: the task's sentence.
-        feature: (1, D) the encoded image, where the agent shares its encoder.
+        pooled: (1, ...) what the policy's readout takes of the encoded image, where the agent shares its encoder.
     """
 
     seen: dict[str, Any]
     sim: dict[str, np.ndarray]
     instruction: str
-    feature: torch.Tensor | None = None
+    pooled: torch.Tensor | None = None
 
 
 class Agent(Protocol):
     """Something that acts in one environment."""
 
     encoder: FrozenEncoder | None
-    """What turns its image into `Observation.feature`, or None if it asks for none."""
+    """What turns its image into `Observation.pooled`, or None if it asks for none."""
 
     def reset(self, seed: int) -> None:
         """Forget the last episode; `seed` is that of the next one."""
@@ -73,9 +73,9 @@ class PolicyAgent:
 
     @property
     def encoder_key(self) -> tuple:
-        """Equal for agents whose encoders are the same."""
+        """Equal for agents whose encoders and readouts are the same."""
         config = self.policy.config
-        return config.backbone, config.backbone_sha256, config.backbone_precision, config.device
+        return config.readout, config.backbone, config.backbone_sha256, config.backbone_precision, config.device
 
     def reset(self, seed: int) -> None:
         self.policy.reset()
@@ -83,9 +83,9 @@ class PolicyAgent:
     @torch.inference_mode()
     def act(self, observation: Observation) -> np.ndarray:
         batch = preprocess_observation(observation.seen) | {"task": [observation.instruction]}
-        if observation.feature is not None:
+        if observation.pooled is not None:
             del batch[self.policy.config.image_key]
-            batch[self.policy.config.feature_key] = observation.feature
+            batch[POOLED] = observation.pooled
         action = self.postprocessor(self.policy.select_action(self.preprocessor(batch)))
         return action.squeeze(0).cpu().numpy()
 
@@ -102,31 +102,32 @@ class SharedEncoder:
     With a fixed spawn a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
 
     Args:
-        encoder: the encoder.
-        capacity: frames remembered.
+        policy: one of the policies that see with it.
+        capacity: numbers remembered (1.6 GB): a million pooled features, or 4,000 frames' patch features.
     """
 
-    def __init__(self, encoder: FrozenEncoder, capacity: int = 100_000):
-        self.encoder = encoder
+    def __init__(self, policy: FrozenViTChunkPolicy, capacity: int = 400_000_000):
+        self.policy = policy
         self.capacity = capacity
         self._seen: dict[bytes, torch.Tensor] = {}
 
     @torch.inference_mode()
     def __call__(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """Encode (1, 3, H, W) images to (1, D) features."""
+        """Encode (1, 3, H, W) images to the (1, ...) that the policies' readout takes of them."""
         keys = [hashlib.sha256(image.cpu().numpy()).digest() for image in images]
         new = {key: image for key, image in zip(keys, images, strict=True) if key not in self._seen}
-        if len(self._seen) + len(new) > self.capacity:
+        encoded = self._encode(list(new.values()))
+        if new and (len(self._seen) + len(new)) * encoded[0].numel() > self.capacity:
             self._seen = {key: self._seen[key] for key in keys if key in self._seen}
-        self._seen |= zip(new, self._encode(list(new.values())), strict=True)
+        self._seen |= zip(new, encoded, strict=True)
         return [self._seen[key] for key in keys]
 
     def _encode(self, images: list[torch.Tensor]) -> Sequence[torch.Tensor]:
         if not images:
             return []
-        if self.encoder.runtime == "torch" and images[0].device.type == "cpu":
-            return [self.encoder(image) for image in images]  # batches are no faster here, and round differently
-        return self.encoder(torch.cat(images)).split(1)
+        if self.policy.backbone.runtime == "torch" and images[0].device.type == "cpu":
+            return [self.policy.pool(image) for image in images]  # batches are no faster here, and round differently
+        return self.policy.pool(torch.cat(images)).split(1)
 
 
 def share_encoders(agents: Sequence[Agent]) -> dict[SharedEncoder, list[int]]:
@@ -138,17 +139,17 @@ def share_encoders(agents: Sequence[Agent]) -> dict[SharedEncoder, list[int]]:
     for numbers in sharing.values():
         for i in numbers:
             agents[i].encoder = agents[i].policy.backbone = agents[numbers[0]].encoder
-    return {SharedEncoder(agents[numbers[0]].encoder): numbers for numbers in sharing.values()}
+    return {SharedEncoder(agents[numbers[0]].policy): numbers for numbers in sharing.values()}
 
 
 def encode_together(
     agents: Sequence[Agent], encoders: Mapping[SharedEncoder, list[int]], observations: Mapping[int, Observation]
 ) -> dict[int, Observation]:
-    """Give every observation, by its agent's number, its feature: one batch for each encoder."""
+    """Give every observation, by its agent's number, what its readout takes: one batch for each encoder."""
     encoded = dict(observations)
     for encoder, sharing in encoders.items():
         numbers = [i for i in sharing if i in observations]
-        features = encoder([agents[i].image(observations[i]) for i in numbers])
-        for i, feature in zip(numbers, features, strict=True):
-            encoded[i] = replace(observations[i], feature=feature)
+        pooled = encoder([agents[i].image(observations[i]) for i in numbers])
+        for i, one in zip(numbers, pooled, strict=True):
+            encoded[i] = replace(observations[i], pooled=one)
     return encoded

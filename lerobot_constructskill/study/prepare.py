@@ -1,33 +1,29 @@
 """What a study stands on, made once and found again: demonstrations, and their features under every encoder."""
 
+import fcntl
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import draccus
-import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 from safetensors.torch import save_file
+from torch import Tensor
 
 from lerobot_constructskill.demos.recorder import record
 from lerobot_constructskill.demos.settings import GenerateConfig, provenance
-from lerobot_constructskill.features.encode import (
-    PARTS,
-    data_sha256,
-    encode_frames,
-    load_encoder,
-    parts_folder,
-    write_feature_set,
-)
+from lerobot_constructskill.features.encode import PARTS, data_sha256, load_encoder, write_feature_set
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.staging import replaced, staged
 
-ENCODE_BATCH = 16
 GREY = 0.5
 """What a blind policy sees, in every pixel."""
 
@@ -52,8 +48,9 @@ class Store:
             ValueError: it is not such a configuration, or too many attempts failed.
         """
         config, root = self._demonstrations_of(config_file)
-        if not root.exists():
-            record(replace(config, root=str(root), workers=self.workers))
+        with self._alone(root):
+            if not root.exists():
+                record(replace(config, root=str(root), workers=self.workers))
         return LeRobotDataset(config.repo_id, root=root)
 
     def dataset_sha256(self, config_file: str) -> str | None:
@@ -74,6 +71,8 @@ class Store:
     def features(self, demonstrations: LeRobotDataset, policy: dict[str, Any], blind: bool = False) -> LeRobotDataset:
         """The features of demonstrations under a `frozen_vit` policy's encoder; of a grey image if it is `blind`.
 
+        Patch features, 0.2 MB a frame, are there where the policy's readout looks at them.
+
         Raises:
             FileNotFoundError: no source has the encoder's weights.
         """
@@ -83,32 +82,46 @@ class Store:
             policy.get("backbone_path"),
             policy.get("backbone_precision", "float32"),
         )
-        made_of = {**info, "camera": camera, "blind": blind}
+        patches = READOUTS[policy.get("readout", "cls")].reads_patches
+        made_of = {**info, "camera": camera, "blind": blind} | ({"patches": True} if patches else {})
         root = self.root / f"{demonstrations.root.name}-features-{_digest(made_of)}"
         repo_id = f"{demonstrations.repo_id}_{info['backbone']}"
-        if not root.exists():
-            with staged(root, keep=PARTS) as folder:
-                if blind:
-                    features = _encode_grey(demonstrations, encoder)
-                else:
-                    parts = parts_folder(folder, demonstrations, camera, info, patches=False)
-                    features = encode_frames(demonstrations, camera, encoder, ENCODE_BATCH, parts)
-                write_feature_set(demonstrations, camera, features, info, repo_id, folder)
+        with self._alone(root):
+            if not root.exists():
+                eyes = Blindfolded(encoder) if blind else encoder
+                with staged(root, keep=PARTS) as folder:
+                    write_feature_set(demonstrations, camera, eyes, info, repo_id, folder, patches=patches)
         return LeRobotDataset(repo_id, root=root)
 
     def untrained_weights(self, backbone: str) -> Path:
         """Random weights of a backbone's architecture: what is its pretraining worth?"""
         path = self.root / f"untrained-{backbone}.safetensors"
-        if not path.exists():
-            with torch.random.fork_rng(devices=[]), replaced(path) as partial:
-                torch.manual_seed(0)
-                save_file(get_backbone(backbone).build().state_dict(), partial)
+        with self._alone(path):
+            if not path.exists():
+                with torch.random.fork_rng(devices=[]), replaced(path) as partial:
+                    torch.manual_seed(0)
+                    save_file(get_backbone(backbone).build().state_dict(), partial)
         return path
 
+    @contextmanager
+    def _alone(self, path: Path) -> Iterator[None]:
+        """Wait until no other job, here or on a machine that shares the folder, makes `path`."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        with (self.root / f".{path.name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            yield
 
-def _encode_grey(demonstrations: LeRobotDataset, encoder: FrozenEncoder) -> np.ndarray:
-    feature = encoder(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY))
-    return feature.expand(demonstrations.num_frames, -1).numpy().copy()
+
+class Blindfolded:
+    """An encoder that is shown a grey image, whatever there is to see."""
+
+    def __init__(self, encoder: FrozenEncoder):
+        self.spec, self.device = encoder.spec, encoder.device
+        self.tokens = encoder.encode(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY))
+
+    def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the grey image's tokens once for each of `images`, as `FrozenEncoder.encode` does."""
+        return tuple(token.expand(len(images), *token.shape[1:]) for token in self.tokens)
 
 
 _cached_sha256 = cache(data_sha256)

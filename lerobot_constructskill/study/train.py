@@ -1,7 +1,9 @@
 """Many training seeds in one pass over a feature set, each of which ends as an ordinary LeRobot checkpoint.
 
 The heads of every seed are stacked and stepped together. AdamW works element by element, gradients are clipped per
-seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding.
+seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding. Where a
+readout learns, each step reads 100 MB of patch features per seed, and stacking them would only cost memory: the seeds
+then train one after another.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,12 +14,13 @@ from pathlib import Path
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from tqdm import tqdm
 
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.features import open_patches
 from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads, chunk_errors
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.study.plan import Training
@@ -51,13 +54,15 @@ def train_seeds(
         )
     table = _read_table(template, dataset)
     is_heldout = _episodes(dataset) % training.holdout == training.holdout - 1
-    inputs = template.head_inputs(table)
-    heads = [_fresh_heads(template, inputs.shape[1], seed) for seed in seeds]
+    inputs = _head_inputs(template, table)
     rows = torch.nonzero(~is_heldout).squeeze(1)
-    _step_together(heads, template.config, inputs, table, [_Order(rows, seed) for seed in seeds], training)
+    heads = [_fresh_heads(template, seed) for seed in seeds]
+    orders = [_Order(rows, seed) for seed in seeds]
+    at_once = 1 if template.readout.learns else len(seeds)
+    for some in (slice(first, first + at_once) for first in range(0, len(seeds), at_once)):
+        _step_together(heads[some], template.config, inputs, table, orders[some], training)
     policies = [_with_heads(template, its_heads) for its_heads in heads]
-    heldout = {name: column[is_heldout] for name, column in table.items()} if is_heldout.any() else None
-    errors = [policy.translation_mse(heldout) if heldout else None for policy in policies]
+    errors = [_heldout_mse(policy, table, is_heldout) for policy in policies]
     return [Trained(*one) for one in zip(seeds, policies, errors, strict=True)]
 
 
@@ -86,8 +91,8 @@ def _episodes(dataset: LeRobotDataset) -> Tensor:
 def _read_table(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> dict[str, Tensor]:
     """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T)."""
     columns = dataset.hf_dataset.with_format("numpy")
-    names = [policy.config.feature_key, *(n for n in policy.config.input_features if n in columns.column_names)]
-    table = {name: torch.as_tensor(columns[name][:]) for name in names}
+    names = policy.config.feature_key, "index", *policy.config.input_features
+    table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
     rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
     table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
     table[f"{ACTION}_is_pad"] = rows > last
@@ -102,35 +107,62 @@ def _chunk_rows(episodes: Tensor, chunk_size: int) -> tuple[Tensor, Tensor]:
     return rows[:, None] + torch.arange(chunk_size), last[:, None]
 
 
-def _fresh_heads(policy: FrozenViTChunkPolicy, input_dim: int, seed: int) -> ChunkHeads:
+def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tuple[Tensor, ...]:
+    """What the heads see of every row; patch features that a readout learns from stay on the disk."""
+    state = (table[OBS_STATE],) if policy.config.use_state else ()
+    if policy.readout.learns:
+        return open_patches(policy.patches_root), *state
+    pooled = [policy.head_inputs(rows)[0] for rows in _split(table)]
+    return torch.cat(pooled), *state
+
+
+def _heldout_mse(policy: FrozenViTChunkPolicy, table: dict[str, Tensor], is_heldout: Tensor) -> float | None:
+    if not is_heldout.any():
+        return None
+    heldout = {name: column[is_heldout] for name, column in table.items()}
+    totals, counts = zip(*(policy.translation_error(rows) for rows in _split(heldout)), strict=True)
+    return sum(totals) / sum(counts)
+
+
+def _split(table: dict[str, Tensor], size: int = 256) -> Iterator[dict[str, Tensor]]:
+    """Yield a table in pieces: patch features take 0.4 MB a row."""
+    for first in range(0, len(table[ACTION]), size):
+        yield {name: column[first : first + size] for name, column in table.items()}
+
+
+def _fresh_heads(policy: FrozenViTChunkPolicy, seed: int) -> ChunkHeads:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        heads = ChunkHeads(input_dim, *policy.heads.chunk_shape, policy.heads.action_scale)
-    return heads.to(policy.config.device)
+        return policy.fresh_heads().to(policy.config.device)
 
 
 def _step_together(
     heads: Sequence[ChunkHeads],
     config: FrozenViTChunkConfig,
-    inputs: Tensor,
+    inputs: tuple[Tensor, ...],
     table: dict[str, Tensor],
     orders: Sequence[_Order],
     training: Training,
 ) -> None:
     """Train `heads` in place."""
-    preset = config.get_optimizer_preset()
+    preset, weight = config.get_optimizer_preset(), config.regression_weight
     stacked, _ = stack_module_state(list(heads))
     parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
     optimizer = preset.build(list(parameters.values()))
     n_steps = training.epochs * -(-len(orders[0].rows) // training.batch_size)
+    schedule = config.get_scheduler_preset()
+    scheduler = schedule.build(optimizer, n_steps) if schedule else None
     for batch in tqdm(_batches(orders, training), f"training {len(heads)} seeds", n_steps, unit="step"):
         target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
-        raw = vmap(lambda own, seen: functional_call(heads[0], own, (seen,)))(parameters, inputs[batch])
-        losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss())(raw, target, padded)
+        seen = [column[batch].float() for column in inputs]
+        raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
+        losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss(weight))(raw, target, padded)
         optimizer.zero_grad()
         losses.sum().backward()
         _clip_each(parameters.values(), preset.grad_clip_norm)
         optimizer.step()
+        if scheduler:
+            scheduler.step()
     for number, own in enumerate(heads):
         own.load_state_dict({name: tensor[number] for name, tensor in parameters.items()})
 

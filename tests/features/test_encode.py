@@ -14,10 +14,11 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.features import encode as features_encode
-from lerobot_constructskill.features.encode import PATCHES_FILE, load_encoder
+from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
 from lerobot_constructskill.staging import MARK
 
@@ -150,6 +151,22 @@ def test_the_policy_trains_on_features_and_declares_the_camera(encoded, weights)
     loss, _ = policy.train().forward(batch)
     loss.backward()
     assert batch[KEY].shape == (4, 192) and batch["action_is_pad"].any() and torch.isfinite(loss)
+
+
+def test_a_readout_of_patches_trains_on_a_set_that_has_them(source, encoded, weights, tmp_path):
+    policy_fields = policy_config(weights, readout="mean")
+    with pytest.raises(FileNotFoundError, match="--patches=true"):
+        make_policy(policy_fields, ds_meta=encoded.meta)
+    encode(settings(source, weights, tmp_path / "out", patches=True))
+    chunks = {"action": [i / 20 for i in range(8)]}
+    dataset = LeRobotDataset("local/out", root=tmp_path / "out", delta_timestamps=chunks)
+    policy = make_policy(policy_fields, ds_meta=dataset.meta)
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    rows = [5, 0, 3]
+    batch = preprocess(torch.utils.data.default_collate([dataset[i] for i in rows]))
+    images = torch.stack([source[i]["observation.images.base"] for i in rows])
+    seen = policy.predict_action_chunk({"observation.images.base": images})
+    torch.testing.assert_close(policy.predict_action_chunk(batch), seen, atol=1e-4, rtol=1e-2)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED, FrozenViTChunkPolicy
 
 TINY = "vit_tiny16"
 
@@ -59,7 +59,7 @@ def make_policy(weights: Callable[..., Path]) -> MakePolicy:
 
 @pytest.fixture
 def make_batch() -> Callable[..., Batch]:
-    """Make a batch of features, states and chunks; the last two steps of sample 0 are padded."""
+    """Make a batch of what the readout takes, states and chunks; the last two steps of sample 0 are padded."""
 
     def make(policy: FrozenViTChunkPolicy, size: int = 4, seed: int = 0) -> Batch:
         rng = torch.Generator().manual_seed(seed)
@@ -68,8 +68,10 @@ def make_batch() -> Callable[..., Batch]:
         action[..., -1] = torch.where(action[..., 0] > 0, 1.0, -1.0)
         padded = torch.zeros(size, steps, dtype=torch.bool)
         padded[0, -2:] = steps > 2
+        spec = policy.backbone.spec
+        tokens = torch.randn(size, 1 + spec.n_patches, spec.feature_dim, generator=rng)
         return {
-            "observation.features.base": torch.randn(size, policy.backbone.spec.feature_dim, generator=rng),
+            POOLED: policy.readout.pool(tokens[:, 0], tokens[:, 1:]),
             "observation.state": torch.randn(size, 8, generator=rng),
             "action": action,
             "action_is_pad": padded,

@@ -6,9 +6,12 @@ import pytest
 import torch
 
 from lerobot_constructskill.policies.frozen_vit.ensembling import ensemble
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED
+from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS, SpatialSoftmax
 
 ABLATIONS = [{}, {"chunk_size": 1}, {"temporal_ensemble_coeff": None}, {"gripper_head": "regression"}]
-BACKENDS = [*ABLATIONS, {"use_state": True}, {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]}]
+OTHER = [{"use_state": True}, {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]}, {"regression_weight": 100.0}]
+VARIANTS = [*ABLATIONS, *OTHER, *({"readout": name, "use_state": True} for name in READOUTS)]
 
 
 def logits(policy, translation: float, gripper: list[float]) -> torch.Tensor:
@@ -18,7 +21,7 @@ def logits(policy, translation: float, gripper: list[float]) -> torch.Tensor:
     return chunk
 
 
-@pytest.mark.parametrize("fields", BACKENDS)
+@pytest.mark.parametrize("fields", VARIANTS, ids=str)
 def test_every_variant_learns_and_acts(fields, make_policy, make_batch):
     policy = make_policy(**fields).train()
     batch = make_batch(policy)
@@ -168,11 +171,11 @@ def test_features_give_the_same_action_as_the_image(make_policy, images):
 
 def test_standardised_features_are_the_same_linear_heads_in_other_units(make_policy, make_batch, tmp_path):
     batch = make_batch(make_policy())
-    features = batch["observation.features.base"]
+    features = batch[POOLED]
     stats = {"observation.features.base": {"mean": features.mean(0) + 1.0, "std": features.std(0) * 2}}
     standardised = make_policy(standardize_features=True, dataset_stats=stats)
     mean, std = (torch.as_tensor(value) for value in stats["observation.features.base"].values())
-    moved = {**batch, "observation.features.base": features * std + mean}
+    moved = {**batch, POOLED: features * std + mean}
     torch.testing.assert_close(
         standardised.predict_action_chunk(moved), make_policy().predict_action_chunk(batch), atol=1e-5, rtol=1e-4
     )
@@ -194,3 +197,23 @@ def test_a_batch_without_camera_says_what_it_holds(make_policy):
 def test_peft_is_refused(make_policy):
     with pytest.raises(NotImplementedError, match="PEFT"):
         make_policy().wrap_with_peft()
+
+
+@pytest.mark.parametrize("name", READOUTS)
+def test_a_readout_sees_the_image(name, make_policy, images):
+    """What it is given beforehand is what it takes itself, and it tells one image from another."""
+    policy = make_policy(readout=name)
+    chunk = policy.predict_action_chunk({"observation.images.base": images})
+    torch.testing.assert_close(chunk, policy.predict_action_chunk({POOLED: policy.pool(images)}))
+    assert not torch.equal(chunk[0], chunk[1])
+
+
+@pytest.mark.parametrize(("patch", "position"), [(0, (-0.75, -0.75)), (3, (0.75, -0.75)), (14, (0.25, 0.75))])
+def test_a_keypoint_is_where_its_pattern_is(patch, position):
+    """On a grid of 4 x 4 patches: x to the right, y down."""
+    readout = SpatialSoftmax(dim=2, keypoints=1)
+    with torch.no_grad():
+        readout.patterns.weight.copy_(torch.tensor([[100.0, 0.0]]))
+    patches = torch.zeros(1, 16, 2)
+    patches[0, patch, 0] = 1
+    torch.testing.assert_close(readout(patches), torch.tensor([position]))

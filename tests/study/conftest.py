@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import describe
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 
 TINY = "vit_tiny16"
@@ -30,7 +30,7 @@ def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def feature_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> LeRobotDataset:
-    """Eight episodes whose actions are a linear function of random features."""
+    """Eight episodes whose actions are a linear function of random features, and random patch features beside them."""
     spec = BACKBONES[TINY]
     encoder = FrozenEncoder(spec)
     encoder.model.load_state_dict(load_file(tiny_weights))
@@ -61,6 +61,8 @@ def feature_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) ->
             )
         dataset.save_episode()
     dataset.finalize()
+    patches = rng.normal(size=(EPISODES * LENGTH, spec.n_patches, dim)).astype(np.float16)
+    np.save(root / PATCHES_FILE, patches)
     return LeRobotDataset("local/random", root=root)
 
 

@@ -49,6 +49,7 @@ def lerobots_actions(agent, vector, seed):
         {"backbone_precision": "bfloat16"},
         {"backbone_precision": "float32"},
         {"temporal_ensemble_coeff": None, "n_action_steps": 4},
+        {"readout": "spatial_softmax"},
     ],
     ids=str,
 )

@@ -5,12 +5,21 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
+from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.study.agents import PolicyAgent
 from lerobot_constructskill.study.plan import Training
 from lerobot_constructskill.study.train import save_checkpoint, train_seeds
 
 TRAINING = Training(epochs=3, batch_size=16, holdout=4)
-FIELDS = [{}, {"chunk_size": 1}, {"gripper_head": "regression"}, {"use_state": True}, {"standardize_features": True}]
+FIELDS = [
+    {},
+    {"chunk_size": 1},
+    {"gripper_head": "regression"},
+    {"use_state": True},
+    {"standardize_features": True},
+    {"regression_weight": 100.0, "scheduler_warmup_steps": 4},
+    *({"readout": name, "use_state": readout.learns} for name, readout in READOUTS.items() if name != "cls"),
+]
 
 
 def chunked(dataset, policy):
@@ -29,7 +38,9 @@ def train_alone(config, dataset, seed, training):
     preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
     preset = policy.config.get_optimizer_preset()
     optimizer = preset.build(policy.get_optim_params())
+    schedule = policy.config.get_scheduler_preset()
     rows = [i for i in range(len(items)) if int(items[i]["episode_index"]) % training.holdout != training.holdout - 1]
+    scheduler = schedule and schedule.build(optimizer, training.epochs * -(-len(rows) // training.batch_size))
     generator = torch.Generator().manual_seed(seed)
     for _ in range(training.epochs):
         order = torch.tensor(rows)[torch.randperm(len(rows), generator=generator)]
@@ -39,6 +50,7 @@ def train_alone(config, dataset, seed, training):
             loss.backward()
             torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), preset.grad_clip_norm)
             optimizer.step()
+            _ = scheduler and scheduler.step()
     return policy
 
 
@@ -64,8 +76,9 @@ def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monk
     torch.testing.assert_close(weight, alone.heads.translation.weight, atol=1e-6, rtol=1e-4)
 
 
-def test_the_held_out_error_is_that_of_every_fourth_episode(config, feature_set):
-    (trained,) = train_seeds(config(), feature_set, [0], TRAINING)
+@pytest.mark.parametrize("readout", ["cls", "attention"])
+def test_the_held_out_error_is_that_of_every_fourth_episode(readout, config, feature_set):
+    (trained,) = train_seeds(config(readout=readout), feature_set, [0], TRAINING)
     items = [item for item in chunked(feature_set, trained.policy) if int(item["episode_index"]) in (3, 7)]
     batch = torch.utils.data.default_collate(items)
     error = (trained.policy.predict_action_chunk(batch) - batch["action"])[~batch["action_is_pad"]][:, :3]

@@ -5,11 +5,13 @@ from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from .backbones import IMAGE_SIZE, get_backbone
 from .encoder import PRECISIONS
 from .features import feature_key
+from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
@@ -37,10 +39,15 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
+        readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
+            feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
+            ("spatial_softmax"), or what a few learned queries find ("attention"). On a feature set all but the
+            first need its patch features.
         standardize_features: whether the heads see each feature with the data set's mean and deviation taken
             out. The linear heads can express the same functions either way (the paper's is False), but Adam gets
             there in far fewer samples. Needs a feature set, whose statistics go into the checkpoint; they are
-            those that LeRobot computes, of the whole data set, episodes held out for evaluation included.
+            those that LeRobot computes, of the whole data set, episodes held out for evaluation included. For
+            the readout "cls" alone.
         use_state: whether the heads also see the normalised `observation.state`.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
@@ -51,6 +58,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
             exp(-coeff * i). -0.1 is the paper's exp(-0.1 k) with k the steps since a chunk was predicted: the
             newest weighs most. None takes the newest chunk's first action.
+        regression_weight: weight of the translations' squared error, some 1e-4 m2, beside the gripper's loss. Heads
+            that share no parameters need none; a readout that learns serves both.
+        scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
+            None keeps it constant, as the paper does.
     """
 
     n_obs_steps: int = 1
@@ -72,6 +83,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_precision: str = "float32"
     save_backbone: bool = True
     camera: str = "base"
+    readout: str = "cls"
     standardize_features: bool = False
     use_state: bool = False
 
@@ -81,8 +93,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     gripper_threshold: float = 0.5
     temporal_ensemble_coeff: float | None = -0.1
 
+    regression_weight: float = 1.0
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 1e-2
+    scheduler_warmup_steps: int | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,6 +104,12 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         get_backbone(self.backbone)
         _check_choice("backbone_precision", self.backbone_precision, PRECISIONS)
         _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)
+        _check_choice("readout", self.readout, tuple(READOUTS))
+        if self.standardize_features and self.readout != "cls":
+            raise ValueError(
+                f"standardize_features serves readout=cls alone, got readout={self.readout}: the statistics of a "
+                "feature set are those of its pooled feature."
+            )
         _check_action_names(self.action_names)
         if self.n_obs_steps != 1:
             raise ValueError(f"n_obs_steps must be 1 (frozen_vit sees one frame), got {self.n_obs_steps}.")
@@ -104,6 +124,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
                 f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
                 "temporal_ensemble_coeff=null to take several steps of one chunk."
             )
+        if self.scheduler_warmup_steps is not None and self.scheduler_warmup_steps < 0:
+            raise ValueError(f"scheduler_warmup_steps must be at least 0, got {self.scheduler_warmup_steps}.")
+        if self.regression_weight <= 0:
+            raise ValueError(f"regression_weight must be above 0, got {self.regression_weight}.")
         if self.action_scale <= 0:
             raise ValueError(f"action_scale must be above 0 (metres and radians), got {self.action_scale}.")
 
@@ -163,8 +187,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     def get_optimizer_preset(self) -> AdamWConfig:
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
-    def get_scheduler_preset(self) -> None:
-        return None
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig | None:
+        if self.scheduler_warmup_steps is None:
+            return None
+        return CosineAnnealingWithWarmupSchedulerConfig(self.scheduler_warmup_steps)
 
     @property
     def observation_delta_indices(self) -> None:

@@ -36,9 +36,13 @@ class FrozenEncoder(nn.Module):
         self.train(False)
 
     @property
+    def device(self) -> torch.device:
+        return self.mean.device
+
+    @property
     def runtime(self) -> str:
         """What computes the features on this machine."""
-        return "openvino" if self._is_compiled_for(self.mean.device) else "torch"
+        return "openvino" if self._is_compiled_for(self.device) else "torch"
 
     def train(self, mode: bool = True) -> "FrozenEncoder":
         return super().train(False)

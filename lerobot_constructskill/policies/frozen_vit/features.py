@@ -1,10 +1,19 @@
 """Feature sets: data sets that carry an encoder's output in place of video, and say whose output it is."""
 
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
 
 from .backbones import IMAGE_SIZE, Backbone
 
 FEATURE_PREFIX = "observation.features."
+
+PATCHES_FILE = "patch_features.npy"
+"""Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
 
 DESCRIBED = ("backbone", "weights_sha256", "precision", "readout", "preprocessing")
 """What must agree between a feature set and the policy that reads it."""
@@ -13,6 +22,26 @@ DESCRIBED = ("backbone", "weights_sha256", "precision", "readout", "preprocessin
 def feature_key(camera: str) -> str:
     """Column that holds the encoded frames of `camera`, (D,) float32."""
     return FEATURE_PREFIX + camera
+
+
+def open_patches(root: Path) -> Tensor:
+    """Return the patch features of a feature set, (N, P, D) float16, which stay on the disk until a row is read.
+
+    Raises:
+        FileNotFoundError: the set was encoded without them.
+    """
+    file = Path(root) / PATCHES_FILE
+    if not file.exists():
+        raise FileNotFoundError(
+            f"The feature set in {root} has no {PATCHES_FILE}, which this readout needs: encode the data set with "
+            "constructskill-encode --patches=true."
+        )
+    return _mapped(file)
+
+
+@cache
+def _mapped(file: Path) -> Tensor:
+    return torch.from_numpy(np.load(file, mmap_mode="c"))  # torch takes no read-only memory
 
 
 def describe(backbone: Backbone, weights_sha256: str, precision: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The part that trains: two linear heads from one input vector to a chunk of actions, and their loss."""
+"""The part that trains: a readout and two linear heads, from tokens to a chunk of actions; and their loss."""
 
 from typing import NamedTuple
 
@@ -8,24 +8,29 @@ from torch import Tensor, nn
 
 
 class ChunkHeads(nn.Module):
-    """Two linear layers that share no weights (paper, section II).
+    """Two linear layers that share no weights (paper, section II), on one vector.
 
     Args:
-        input_dim: length of the input vector.
+        readout: makes that vector of what was pooled of the tokens; it may have parameters of its own.
+        input_dim: length of the vector, with the state where the heads see it.
         chunk_size: steps T predicted at once.
         n_regressed: translations (and rotations) R of an action; the gripper makes A = R + 1.
         action_scale: bound of the regression, in metres (and radians).
     """
 
-    def __init__(self, input_dim: int, chunk_size: int, n_regressed: int, action_scale: float):
+    def __init__(self, readout: nn.Module, input_dim: int, chunk_size: int, n_regressed: int, action_scale: float):
         super().__init__()
         self.chunk_shape = (chunk_size, n_regressed)
         self.action_scale = action_scale
+        self.readout = readout
         self.translation = nn.Linear(input_dim, chunk_size * n_regressed)
         self.gripper = nn.Linear(input_dim, chunk_size)
 
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Return (B, T, A) for inputs (B, input_dim): bounded translations, then the gripper's logit or number."""
+    def forward(self, pooled: Tensor, state: Tensor | None = None) -> Tensor:
+        """Return (B, T, A) for pooled tokens (B, ...): bounded translations, then the gripper's logit or number."""
+        inputs = self.readout(pooled)
+        if state is not None:
+            inputs = torch.cat([inputs, state], dim=-1)
         regressed = self.translation(inputs).unflatten(-1, self.chunk_shape)
         return torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
 
@@ -49,13 +54,14 @@ class ChunkErrors(NamedTuple):
     def gripper_loss(self) -> Tensor:
         return self.gripper.sum() / self.n_valid.sum()
 
-    def loss(self) -> Tensor:
-        """The mean over all valid steps; the two terms need no weights, because the heads share none."""
-        return self.regression_loss() + self.gripper_loss()
+    def loss(self, regression_weight: float) -> Tensor:
+        """The mean over all valid steps."""
+        return regression_weight * self.regression_loss() + self.gripper_loss()
 
-    def loss_per_sample(self) -> Tensor:
+    def loss_per_sample(self, regression_weight: float) -> Tensor:
         """The mean over each sample's valid steps, (B,)."""
-        return (self.squared.mean(dim=-1) + self.gripper).sum(dim=1) / self.n_valid.clamp(min=1)
+        errors = regression_weight * self.squared.mean(dim=-1) + self.gripper
+        return errors.sum(dim=1) / self.n_valid.clamp(min=1)
 
 
 def chunk_errors(raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str) -> ChunkErrors:

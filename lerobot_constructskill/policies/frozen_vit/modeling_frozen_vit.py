@@ -15,12 +15,15 @@ from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
 from .ensembling import ensemble
-from .features import check_features, describe
+from .features import check_features, describe, open_patches
 from .heads import ChunkErrors, ChunkHeads, chunk_errors
+from .readouts import READOUTS
 from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
+POOLED = "observation.pooled"
+"""What `pool` returned for the image, in batches of rollouts that share an encoder."""
 
 logger = logging.getLogger(__name__)
 
@@ -31,10 +34,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     Args:
         config: the configuration; the source and hash of the backbone's weights are written into it.
         dataset_stats: the data set's statistics as LeRobot keeps them; a feature set's serve `standardize_features`.
+        dataset_meta: the data set's `LeRobotDatasetMetadata`; a feature set's patch features lie in its folder.
         load_backbone: False leaves the backbone without weights; `from_pretrained` fills it.
 
     Raises:
-        FileNotFoundError: the backbone's weights cannot be had.
+        FileNotFoundError: the backbone's weights cannot be had, or the readout's patch features are not there.
         ValueError: the data set's features are another encoder's, or the inputs do not fit the configuration.
     """
 
@@ -46,6 +50,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         config: FrozenViTChunkConfig,
         *,
         dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: Any = None,
         load_backbone: bool = True,
         **kwargs: Any,
     ):
@@ -59,10 +64,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if config.feature_column is not None:
             expected = describe(spec, config.backbone_sha256, config.backbone_precision)
             check_features(config.feature_column, expected, spec.feature_dim)
-
-        state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
-        n_regressed = len(config.action_names) - 1
-        self.heads = ChunkHeads(spec.feature_dim + state_dim, config.chunk_size, n_regressed, config.action_scale)
+        self.readout = READOUTS[config.readout]
+        self.patches_root = dataset_meta.root if dataset_meta is not None else None
+        if config.feature_column is not None and self.readout.reads_patches:
+            open_patches(self.patches_root)
+        self.heads = self.fresh_heads()
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
         self.register_buffer("feature_std", torch.ones(spec.feature_dim))
@@ -74,6 +80,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._heldout = [0.0, 0]
         self._heldout_report: dict[str, float] = {}
         self.reset()
+
+    def fresh_heads(self) -> ChunkHeads:
+        """Return heads with newly drawn weights."""
+        config, dim = self.config, self.backbone.spec.feature_dim
+        state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
+        sizes = self.readout.dim(dim) + state_dim, config.chunk_size, len(config.action_names) - 1
+        return ChunkHeads(self.readout.build(dim), *sizes, config.action_scale)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -101,7 +114,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             self._heldout_report = {}
         else:
             self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
-        return (errors.loss_per_sample() if reduction == "none" else errors.loss()), logs
+        loss = errors.loss_per_sample if reduction == "none" else errors.loss
+        return loss(self.config.regression_weight), logs
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
         """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
@@ -204,33 +218,45 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
             )
 
-    def head_inputs(self, batch: dict[str, Tensor]) -> Tensor:
-        """Return what the heads see, (B, D): the feature, standardised if the configuration says so, and the state."""
-        inputs = (self._features(batch) - self.feature_mean) / self.feature_std
-        return torch.cat([inputs, batch[OBS_STATE]], dim=-1) if self.config.use_state else inputs
+    def pool(self, images: Tensor) -> Tensor:
+        """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1]."""
+        return self.readout.pool(*self.backbone.encode(images))
+
+    def head_inputs(self, batch: dict[str, Tensor]) -> tuple[Tensor, ...]:
+        """Return the arguments of the heads: the pooled tokens, standardised if so configured, and any state."""
+        pooled = self._pooled(batch)
+        if self.config.standardize_features:
+            pooled = (pooled - self.feature_mean) / self.feature_std
+        return (pooled, batch[OBS_STATE]) if self.config.use_state else (pooled,)
 
     @torch.no_grad()
-    def translation_mse(self, batch: dict[str, Tensor]) -> float:
-        """Return the mean squared translation error over all valid steps of a batch, in m2."""
-        total, count = self._translation_error(self._chunk_errors(batch))
-        return total / count
+    def translation_error(self, batch: dict[str, Tensor]) -> tuple[float, int]:
+        """Return the sum of a batch's squared translation errors over valid steps, in m2, and of how many numbers."""
+        return self._translation_error(self._chunk_errors(batch))
 
     def _chunk_errors(self, batch: dict[str, Tensor]) -> ChunkErrors:
         padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
         return chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, self.config.gripper_head)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.heads(self.head_inputs(batch))
+        return self.heads(*self.head_inputs(batch))
 
-    def _features(self, batch: dict[str, Tensor]) -> Tensor:
+    def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
+        if POOLED in batch:
+            return batch[POOLED]
         if self.config.feature_key in batch:
-            return batch[self.config.feature_key].float()
+            cls = batch[self.config.feature_key].float()
+            return self.readout.pool(cls, self._patches(batch).to(cls)) if self.readout.reads_patches else cls
         if self.config.image_key in batch:
-            return self.backbone(batch[self.config.image_key])
+            return self.pool(batch[self.config.image_key])
         raise ValueError(
             f"frozen_vit needs {self.config.image_key} or {self.config.feature_key}; the batch holds: "
             f"{', '.join(batch)}."
         )
+
+    def _patches(self, batch: dict[str, Tensor]) -> Tensor:
+        """Patch features (B, N, D) float16 of a feature set's frames, by their `index`."""
+        return open_patches(self.patches_root)[batch["index"].cpu()]
 
     def _to_action(self, raw: Tensor) -> Tensor:
         boundary = 0.0 if self.config.gripper_head == "regression" else self.config.gripper_threshold

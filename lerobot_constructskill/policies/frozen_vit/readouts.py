@@ -1,0 +1,90 @@
+"""From an encoder's tokens to the one vector that the linear heads see: one entry of `READOUTS` each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+KEYPOINTS = 32
+"""Feature maps of `spatial_softmax`, LeRobot's default for Diffusion Policy."""
+
+QUERIES = 4
+"""Learned queries of `attention`."""
+
+
+@dataclass(frozen=True)
+class Readout:
+    """What the heads see of an image.
+
+    Args:
+        pool: `(cls (B, D), patches (B, N, D)) -> (B, ...)`: what is taken of the tokens, without parameters.
+        build: `D -> module` that trains with the heads and makes one vector of what `pool` took.
+        dim: `D -> length` of that vector.
+        reads_patches: whether `pool` looks at the patches at all.
+        learns: whether the module has parameters, so that what it returns changes in training.
+    """
+
+    pool: Callable[[Tensor, Tensor], Tensor]
+    dim: Callable[[int], int]
+    build: Callable[[int], nn.Module] = lambda dim: nn.Identity()
+    reads_patches: bool = True
+    learns: bool = False
+
+
+class SpatialSoftmax(nn.Module):
+    """Where in the image each of K learned patterns is: the expected position under a softmax over the patches.
+
+    As in Finn et al. 2016 (Deep Spatial Autoencoders) and LeRobot's Diffusion Policy, on a transformer's patches.
+
+    Args:
+        dim: length D of a patch feature.
+        keypoints: patterns K.
+    """
+
+    def __init__(self, dim: int, keypoints: int = KEYPOINTS):
+        super().__init__()
+        self.patterns = nn.Linear(dim, keypoints, bias=False)  # the softmax would take a bias out
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """Return (B, 2K) for patches (B, N, D) of a square grid: x then y of each keypoint, from -1 to 1."""
+        attention = self.patterns(patches).softmax(dim=-2)
+        positions = attention.transpose(-1, -2) @ _grid(patches.shape[-2]).to(patches)
+        return positions.flatten(-2)
+
+
+class AttentionPooling(nn.Module):
+    """What a few learned queries find in the image: each a weighted mean of the patches (attentive probing).
+
+    Args:
+        dim: length D of a patch feature.
+        queries: how many, Q.
+    """
+
+    def __init__(self, dim: int, queries: int = QUERIES):
+        super().__init__()
+        self.queries = nn.Linear(dim, queries, bias=False)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """Return (B, Q D) for patches (B, N, D)."""
+        attention = self.queries(patches).softmax(dim=-2)
+        return (attention.transpose(-1, -2) @ patches).flatten(-2)
+
+
+def _grid(n_patches: int) -> Tensor:
+    """Centres (N, 2) of a square grid's patches in row-major order: x to the right and y down, from -1 to 1."""
+    side = round(n_patches**0.5)
+    line = (torch.arange(side) + 0.5) / side * 2 - 1
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    return torch.stack([x, y], dim=-1).reshape(-1, 2)
+
+
+READOUTS = {
+    "cls": Readout(lambda cls, patches: cls, lambda dim: dim, reads_patches=False),
+    "mean": Readout(lambda cls, patches: patches.mean(dim=1), lambda dim: dim),
+    "cls_mean": Readout(lambda cls, patches: torch.cat([cls, patches.mean(dim=1)], dim=-1), lambda dim: 2 * dim),
+    "spatial_softmax": Readout(
+        lambda cls, patches: patches, lambda dim: 2 * KEYPOINTS, build=SpatialSoftmax, learns=True
+    ),
+    "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, build=AttentionPooling, learns=True),
+}
