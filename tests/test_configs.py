@@ -6,11 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import draccus
+import lerobot.policies  # noqa: F401  registers the policies
 import pytest
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.contract import CAMERAS, FPS, get_task
+from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -75,11 +79,66 @@ def test_the_dose_response_is_six_doses_of_fast():
         assert config == replace(fast, noise=replace(fast.noise, sigma=millimetres / 1000))
 
 
+@pytest.fixture
+def train_config(monkeypatch):
+    """Read a file as `lerobot-train --config_path` does; it keeps `policy.path` of a file in module globals."""
+    monkeypatch.setattr(parser, "_config_path_args", {})
+    monkeypatch.setattr(parser, "_config_yaml_overrides", {})
+
+    @parser.wrap()
+    def parse(config: TrainPipelineConfig) -> TrainPipelineConfig:
+        return config
+
+    def read(path: Path, *flags: str) -> TrainPipelineConfig:
+        monkeypatch.setattr("sys.argv", ["lerobot-train", f"--config_path={path}", *flags])
+        return parse()
+
+    return read
+
+
 @pytest.mark.parametrize("path", TRAIN, ids=lambda path: path.stem)
-def test_training_configs_hold_out_every_eighth_episode_and_no_other(path):
-    config = draccus.parse(TrainPipelineConfig, path, args=[])
+def test_training_configs_hold_out_every_eighth_episode_and_no_other(path, train_config):
+    config = train_config(path)
     episodes = config.dataset.episodes
     n_held_out = math.ceil(len(episodes) * config.dataset.eval_split)
     assert sorted(episodes) == list(range(len(episodes)))
     assert episodes[-n_held_out:] == [i for i in range(len(episodes)) if i % 8 == 7]
-    assert config.eval_steps == config.steps
+    assert config.eval_steps and config.steps % config.eval_steps == 0
+
+
+PUBLISHED = {
+    "smolvla": [f"observation.images.camera{i}" for i in (1, 2, 3)],
+    "pi0": [f"observation.images.{name}_0_rgb" for name in ("base", "left_wrist", "right_wrist")],
+    "pi05": [f"observation.images.{name}_0_rgb" for name in ("base", "left_wrist", "right_wrist")],
+}
+"""Cameras of lerobot/smolvla_base, lerobot/pi0_base and lerobot/pi05_base."""
+
+
+def published(kind: str, folder: Path) -> Path:
+    """The configuration of published weights, without the weights; six numbers of state and action, as SmolVLA's."""
+    images = {name: PolicyFeature(FeatureType.VISUAL, (3, 224, 224)) for name in PUBLISHED[kind]}
+    state, action = PolicyFeature(FeatureType.STATE, (6,)), PolicyFeature(FeatureType.ACTION, (6,))
+    config = PreTrainedConfig.get_choice_class(kind)(
+        device="cpu", input_features=images | {"observation.state": state}, output_features={"action": action}
+    )
+    config.save_pretrained(folder)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["act", "diffusion", *PUBLISHED])
+def test_other_policies_accept_our_features_under_the_names_they_know(kind, train_config, tmp_path):
+    """As far as pi0 and pi0.5 are tested here: their 3 billion parameters are never built."""
+    base = [f"--policy.path={published(kind, tmp_path)}"] if kind in PUBLISHED else []
+    config = train_config(CONFIGS / "train" / f"{kind}.yaml", f"--output_dir={tmp_path / 'out'}", *base)
+    config.validate()
+    policy, task = config.policy, get_task("brick_to_bin")
+    columns = demonstration_features(task, "pixels_agent_pos")
+    features = dataset_to_policy_features(columns)
+    policy.output_features = {"action": features.pop("action")}
+    policy.input_features = policy.input_features or features
+    policy.validate_features()
+    renamed = {config.rename_map.get(name, name) for name in features}
+    assert renamed <= policy.input_features.keys() and len(renamed) == len(CAMERAS) + 1
+    assert policy.type == kind and not policy.push_to_hub
+    seconds = policy.n_action_steps / FPS
+    assert 0.3 <= seconds <= 0.5 and max(policy.action_delta_indices) < 60

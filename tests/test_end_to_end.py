@@ -1,7 +1,6 @@
 """The whole path with LeRobot's own scripts, as subprocesses: generate, encode, train, resume, evaluate."""
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
+from commands import QUICK, call
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_constructskill.demos.columns import SIDECAR
@@ -20,20 +20,10 @@ from lerobot_constructskill.study.train import train_seeds
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
-BIN = Path(sys.executable).parent
 HOLD_OUT = ["--dataset.episodes=[0,2,1]", "--dataset.eval_split=0.17"]
 ENV = ["--env.type=constructskill", "--env.episode_length=6"]
 EVAL = ["--eval.n_episodes=2", "--eval.batch_size=2"]
-SHORT = ["--batch_size=8", "--num_workers=0", "--save_freq=2", "--log_freq=1", "--policy.push_to_hub=false"]
-
-
-def call(command: str, *flags: str, fails: bool = False) -> str:
-    """Run a console command on the CPU and without the Hub, and return what it printed."""
-    surroundings = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
-    run = subprocess.run([BIN / command, *flags], env=surroundings, capture_output=True, text=True)
-    printed = run.stdout + run.stderr
-    assert (run.returncode != 0) == fails, printed[-3000:]
-    return printed
+SHORT = ["--batch_size=8", "--policy.push_to_hub=false", *QUICK]
 
 
 @pytest.fixture(scope="module")
@@ -161,15 +151,6 @@ def test_features_of_another_backbone_are_refused_in_one_sentence(features, fold
     flags = ["--policy.type=frozen_vit", "--policy.backbone_precision=bfloat16", *features, *SHORT]
     log = call("lerobot-train", *flags, "--steps=2", f"--output_dir={folder / 'refused'}", fails=True)
     assert "precision float32 (the policy: bfloat16)" in log.strip().splitlines()[-1]
-
-
-def test_stock_act_trains_on_the_data_set_and_runs_in_the_environment(demonstrations, folder):
-    flags = ["--policy.type=act", "--policy.pretrained_backbone_weights=null", *demonstrations, *SHORT, *ENV]
-    small = ["--policy.dim_model=64", "--policy.n_heads=2", "--policy.dim_feedforward=64", "--policy.use_vae=false"]
-    one = ["--eval.n_episodes=1", "--eval.batch_size=1", "--env.obs_type=pixels_agent_pos", "--batch_size=2"]
-    out = folder / "act"
-    call("lerobot-train", *flags, *small, *one, "--steps=2", "--env_eval_freq=2", f"--output_dir={out}")
-    assert list(out.rglob("*.mp4"))
 
 
 def test_lerobots_own_tools_read_the_data_set(demonstrations):

@@ -1,0 +1,19 @@
+"""LeRobot's and our console commands as a user starts them: each in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+BIN = Path(sys.executable).parent
+QUICK = ["--num_workers=0", "--save_freq=2", "--log_freq=1"]
+"""Flags of a `lerobot-train` that takes two steps or a few more."""
+
+
+def call(command: str, *flags: str, fails: bool = False) -> str:
+    """Run a console command on the CPU and without the Hub, and return what it printed."""
+    surroundings = os.environ | {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1"}
+    run = subprocess.run([BIN / command, *flags], env=surroundings, capture_output=True, text=True)
+    printed = run.stdout + run.stderr
+    assert (run.returncode != 0) == fails, printed[-3000:]
+    return printed

@@ -1,0 +1,123 @@
+"""LeRobot's other policies, made small, with the shipped configurations and LeRobot's own scripts as subprocesses.
+
+pi0 and pi0.5 are not run here: they have 3 billion parameters. tests/test_configs.py checks their files.
+"""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from commands import QUICK, call
+from tokenizers import Tokenizer
+from tokenizers.models import WordLevel
+from tokenizers.pre_tokenizers import Whitespace
+from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
+from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.demos.recorder import GenerateConfig, record
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+CONFIGS = Path(__file__).parents[1] / "configs" / "train"
+SMALL = {
+    "act": [
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.dim_model=64",
+        "--policy.n_heads=2",
+        "--policy.dim_feedforward=64",
+    ],
+    "diffusion": [
+        "--policy.pretrained_backbone_weights=null",
+        "--policy.down_dims=[32,64]",
+        "--policy.diffusion_step_embed_dim=16",
+        "--policy.num_inference_steps=2",
+    ],
+    "smolvla": ["--policy.num_steps=2"],
+}
+"""Flags that make a policy small; none of them is about data set, environment or chunks."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("any_policy")
+
+
+@pytest.fixture(scope="module")
+def demonstrations(folder):
+    """Two demonstrations with both cameras and the state, the second held out."""
+    root = folder / "demonstrations"
+    record(GenerateConfig("local/demos", str(root), episodes=2, obs_type="pixels_agent_pos"))
+    return [f"--dataset.root={root}", "--dataset.episodes=[0,1]", "--dataset.eval_split=0.4"]
+
+
+def write_vlm(folder: Path) -> None:
+    """A SmolVLM that knows the words of one instruction: configuration, tokenizer and processor, no weights."""
+    named = {
+        "image_token": "<image>",
+        "fake_image_token": "<fake_token_around_image>",
+        "global_image_token": "<global-img>",
+        "end_of_utterance_token": "<end_of_utterance>",
+    }
+    splitter = Whitespace()
+    words = dict.fromkeys(word for word, _ in splitter.pre_tokenize_str(get_task("brick_to_bin").instruction))
+    vocabulary = {word: i for i, word in enumerate(["<unk>", "<pad>", *named.values(), *words])}
+    tokenizer = Tokenizer(WordLevel(vocabulary, unk_token="<unk>"))
+    tokenizer.pre_tokenizer = splitter
+    wrapped = PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, unk_token="<unk>", pad_token="<pad>", extra_special_tokens=named
+    )
+    SmolVLMProcessor(SmolVLMImageProcessor(), wrapped, SmolVLMVideoProcessor()).save_pretrained(folder)
+    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    text = layers | {"num_key_value_heads": 1, "head_dim": 16, "vocab_size": len(vocabulary), "pad_token_id": 1}
+    vision = layers | {"image_size": 64, "patch_size": 16}
+    SmolVLMConfig(
+        text_config=text, vision_config=vision, scale_factor=2, image_token_id=vocabulary["<image>"], pad_token_id=1
+    ).save_pretrained(folder)
+
+
+@pytest.fixture(scope="module")
+def smolvla_base(folder):
+    """What lerobot/smolvla_base is, with random weights: three cameras and six numbers of state and action."""
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
+    from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
+
+    write_vlm(folder / "vlm")
+    image = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
+    state, action = PolicyFeature(FeatureType.STATE, (6,)), PolicyFeature(FeatureType.ACTION, (6,))
+    config = SmolVLAConfig(
+        device="cpu",
+        input_features={f"observation.images.camera{i}": image for i in (1, 2, 3)} | {"observation.state": state},
+        output_features={"action": action},
+        resize_imgs_with_padding=(64, 64),
+        vlm_model_name=str(folder / "vlm"),
+    )
+    base = folder / "smolvla_base"
+    for part in (SmolVLAPolicy(config), *make_pre_post_processors(config)):
+        part.save_pretrained(base)
+    return base
+
+
+@pytest.fixture(scope="module", params=SMALL)
+def trained(request, folder, demonstrations):
+    """Name of a policy and its checkpoint after two steps of `lerobot-train` on the shipped configuration."""
+    kind, out = request.param, folder / request.param
+    base = [f"--policy.path={request.getfixturevalue('smolvla_base')}"] if kind == "smolvla" else []
+    flags = [f"--config_path={CONFIGS / kind}.yaml", *demonstrations, *base, *SMALL[kind], *QUICK, "--batch_size=2"]
+    log = call("lerobot-train", *flags, "--steps=2", "--eval_steps=2", "--max_eval_samples=2", f"--output_dir={out}")
+    assert "eval_loss=" in log
+    return kind, out / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_a_policy_trains_on_the_data_set_is_saved_and_runs_in_the_environment(trained, folder):
+    kind, checkpoint = trained
+    renames = yaml.safe_load((CONFIGS / f"{kind}.yaml").read_text()).get("rename_map", {})
+    env = ["--env.type=constructskill", "--env.obs_type=pixels_agent_pos", "--env.episode_length=6"]
+    one = ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={folder / 'eval' / kind}"]
+    call("lerobot-eval", f"--policy.path={checkpoint}", f"--rename_map={json.dumps(renames)}", *env, *one)
+    info = json.loads((folder / "eval" / kind / "eval_info.json").read_text())
+    assert info["overall"]["n_episodes"] == 1
+    assert Path(info["overall"]["video_paths"][0]).stat().st_size > 1000
