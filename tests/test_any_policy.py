@@ -17,6 +17,7 @@ from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoPro
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -121,3 +122,14 @@ def test_a_policy_trains_on_the_data_set_is_saved_and_runs_in_the_environment(tr
     info = json.loads((folder / "eval" / kind / "eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 1
     assert Path(info["overall"]["video_paths"][0]).stat().st_size > 1000
+
+
+def test_a_policy_is_evaluated_offline(trained, demonstrations):
+    kind, checkpoint = trained
+    root = Path(demonstrations[0].split("=")[1])
+    out = checkpoint.parent / "offline"
+    evaluate_offline(OfflineConfig([str(checkpoint)], "local/demos", root, episodes=[1], out=out))
+    (row,) = json.loads((out / "offline.json").read_text())
+    assert (row["policy"], row["training_seed"]) == (kind, 1000)
+    assert 0.001 < row["mean_m"] <= row["rmse_m"] < 0.3 and 0 < row["consistency_m"] < 0.3
+    assert 0 <= row["gripper_accuracy"] <= 1 and 0 <= row["gripper_change_accuracy"] <= 1

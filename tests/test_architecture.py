@@ -37,6 +37,7 @@ ARROWS = {
     "study.report": ("contract", "staging"),
     "study.train": ("policies",),
     "study.agents": ("policies",),
+    "study.offline": ("contract",),
     "study.simulators": ("envs",),
     "study.prepare": ("demos", "features", "policies", "staging"),
     "study.references": ("contract", "demos"),

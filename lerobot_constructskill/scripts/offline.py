@@ -1,0 +1,127 @@
+"""`constructskill-offline`: what any LeRobot policies predict on held-out demonstrations, a row a checkpoint."""
+
+import json
+from dataclasses import asdict, dataclass
+from glob import glob
+from pathlib import Path
+
+from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.staging import replaced
+
+
+@dataclass
+class OfflineConfig:
+    """Print and write a table of translation errors in metres, gripper accuracy and chunk consistency."""
+
+    policies: list[str]  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
+    repo_id: str  # the demonstrations
+    root: Path | None = None  # their folder; LeRobot's cache, or the Hub, when left out
+    revision: str | None = None  # tag, branch or commit on the Hub
+    episodes: list[int] | None = None  # held-out demonstrations; every eighth when left out
+    out: Path = Path("outputs/offline")  # folder for offline.json and offline.parquet
+    batch_size: int = 32  # frames at a time
+    seed: int = 0  # of policies that sample their actions
+    device: str | None = None  # default: that of the checkpoint
+
+
+SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
+"""Columns that are printed; the files have all."""
+
+TYPES = {
+    "training_seed": "Int64",
+    "rmse_rotation_rad": float,
+    "gripper_change_accuracy": float,
+    "consistency_m": float,
+}
+"""Columns in which a value can be missing."""
+
+
+def evaluate_offline(config: OfflineConfig) -> str:
+    """Evaluate every checkpoint, write the files and return the table.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint or data set.
+        ValueError: no such episodes.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_constructskill.demos.dart import held_out
+    from lerobot_constructskill.features.encode import data_sha256
+
+    checkpoints = _find(config.policies)
+    dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)
+    episodes = held_out(dataset.num_episodes) if config.episodes is None else config.episodes
+    if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
+        raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+    source = {
+        "episodes": ",".join(map(str, episodes)),
+        "dataset": config.repo_id,
+        "dataset_revision": dataset.revision if config.root is None else None,
+        "dataset_sha256": data_sha256(dataset.root),
+    }
+    rows = [_row(path, dataset, episodes, config) | source for path in checkpoints]
+    return _write(rows, config.out)
+
+
+def _find(patterns: list[str]) -> list[Path]:
+    """Checkpoints that the patterns match, in their order."""
+    found = []
+    for pattern in patterns:
+        folders = [Path(name) for name in sorted(glob(pattern)) if (Path(name) / "config.json").is_file()]
+        if not folders:
+            raise FileNotFoundError(f"'{pattern}' matches no checkpoint's pretrained_model folder.")
+        found += folders
+    return found
+
+
+def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) -> dict:
+    import torch
+
+    import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.study.agents import PolicyAgent
+    from lerobot_constructskill.study.offline import observed, offline_metrics, predict
+
+    agent = PolicyAgent.from_pretrained(checkpoint, config.device)
+    torch.manual_seed(config.seed)
+    view = observed(dataset, agent.policy)
+    pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
+    metrics = offline_metrics(predict(*pipeline, view, episodes, config.batch_size))
+    return {
+        "policy": agent.policy.name,
+        "training_seed": _training_seed(checkpoint),
+        **asdict(metrics),
+        "checkpoint": str(checkpoint),
+        "weights_sha256": _sha256(checkpoint / "model.safetensors"),
+    }
+
+
+def _training_seed(checkpoint: Path) -> int | None:
+    path = checkpoint / "train_config.json"
+    return json.loads(path.read_text()).get("seed") if path.is_file() else None
+
+
+def _sha256(path: Path) -> str:
+    import hashlib
+
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _write(rows: list[dict], folder: Path) -> str:
+    import pandas as pd
+
+    table = pd.DataFrame(rows).astype(TYPES)
+    with replaced(folder / "offline.json") as partial:
+        partial.write_text(json.dumps(rows, indent=2) + "\n")
+    with replaced(folder / "offline.parquet") as partial:
+        table.to_parquet(partial, index=False)
+    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
+    return f"{shown}\n{rows[0]['frames']} frames; every column: {folder / 'offline.json'} and .parquet"
+
+
+def main() -> None:
+    run(OfflineConfig, evaluate_offline)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""What a policy predicts on held-out demonstrations: how far its actions are from theirs, and how steady its chunks.
+
+Every policy is asked the same of every frame, as it was asked in training: a fresh chunk from that frame's
+observation. Action queues and temporal ensembling, which mix chunks of several frames, play no part. Policies that
+sample (diffusion, flow) draw anew for every frame, which their consistency includes.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch.utils.data import DataLoader, Subset
+from tqdm import tqdm
+
+from lerobot_constructskill.contract import TRANSLATION
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """One demonstration of T frames through one policy.
+
+    Args:
+        labels: (T, A) what the demonstration did, in metres (radians), translations first, the gripper last.
+        chunks: (T, C, A) what the policy would do from each frame on; C is 1 for a policy without chunks.
+    """
+
+    labels: np.ndarray
+    chunks: np.ndarray
+
+
+@dataclass(frozen=True)
+class OfflineMetrics:
+    """Means over the frames of all demonstrations, of the first action of every chunk unless said otherwise.
+
+    Args:
+        frames: how many frames.
+        rmse_m: root of the mean squared length of the translation error, in metres.
+        mean_m: mean length of the translation error, in metres.
+        rmse_dx_m, rmse_dy_m, rmse_dz_m: root mean squared error along each axis, in metres.
+        rmse_rotation_rad: root of the mean squared length of the rotation error, in radians; None for tasks that do
+            not turn.
+        gripper_accuracy: share of frames on which the gripper's sign is the demonstration's.
+        gripper_change_accuracy: the same of the two frames around each opening and closing, so that a gripper that
+            never moves gets one half; None where the demonstrations never open nor close.
+        consistency_m: mean distance between what the chunks of two consecutive frames say about the same step's
+            translation, in metres; None for policies without chunks.
+    """
+
+    frames: int
+    rmse_m: float
+    mean_m: float
+    rmse_dx_m: float
+    rmse_dy_m: float
+    rmse_dz_m: float
+    rmse_rotation_rad: float | None
+    gripper_accuracy: float
+    gripper_change_accuracy: float | None
+    consistency_m: float | None
+
+
+def offline_metrics(episodes: Sequence[Predictions]) -> OfflineMetrics:
+    """Compare what was predicted with what was done."""
+    axes = len(TRANSLATION)
+    errors = np.concatenate([one.chunks[:, 0] - one.labels for one in episodes]).astype(np.float64)
+    lengths = np.linalg.norm(errors[:, :axes], axis=1)
+    rotations = np.linalg.norm(errors[:, axes:-1], axis=1)
+    right = [np.sign(one.chunks[:, 0, -1]) == np.sign(one.labels[:, -1]) for one in episodes]
+    around = [_around_changes(one.labels[:, -1]) for one in episodes]
+    at_changes = np.concatenate([hits[frames] for hits, frames in zip(right, around, strict=True)])
+    disagreements = np.concatenate([_disagreements(one.chunks[..., :axes]) for one in episodes])
+    return OfflineMetrics(
+        len(errors),
+        _root_mean_square(lengths),
+        float(lengths.mean()),
+        *(_root_mean_square(error) for error in errors[:, :axes].T),
+        rmse_rotation_rad=_root_mean_square(rotations) if errors.shape[1] > axes + 1 else None,
+        gripper_accuracy=float(np.concatenate(right).mean()),
+        gripper_change_accuracy=float(at_changes.mean()) if len(at_changes) else None,
+        consistency_m=float(disagreements.mean()) if len(disagreements) else None,
+    )
+
+
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _around_changes(gripper: np.ndarray) -> np.ndarray:
+    """Frames before and after each change of sign in (T,) labels."""
+    before = np.flatnonzero(np.diff(np.sign(gripper)))
+    return np.sort(np.concatenate([before, before + 1]))
+
+
+def _disagreements(chunks: np.ndarray) -> np.ndarray:
+    """Distances between (T, C, 3) chunks of consecutive frames, step by step, up to the demonstration's end."""
+    length, size, _ = chunks.shape
+    earlier, later = chunks[:-1, 1:], chunks[1:, : size - 1]
+    distances = np.linalg.norm(earlier.astype(np.float64) - later, axis=-1)
+    steps = np.arange(1, length)[:, None] + np.arange(size - 1)
+    return distances[steps < length]
+
+
+def predict(
+    policy: PreTrainedPolicy,
+    preprocess: Callable,
+    postprocess: Callable,
+    dataset: LeRobotDataset,
+    episodes: Sequence[int],
+    batch_size: int,
+) -> list[Predictions]:
+    """Ask a policy for a chunk from every frame of some demonstrations.
+
+    Args:
+        policy: any LeRobot policy, in evaluation mode.
+        preprocess: from a batch of the data set to what the policy reads.
+        postprocess: from the policy's output to actions in metres.
+        dataset: the data set, as `observed` opens it for this policy.
+        episodes: which demonstrations.
+        batch_size: frames at a time.
+    """
+    predictions = []
+    for episode in tqdm(episodes, policy.name, unit="demo", leave=False):
+        row = dataset.meta.episodes[episode]
+        frames = Subset(dataset, range(row["dataset_from_index"], row["dataset_to_index"]))
+        policy.reset()
+        batches = [_chunks(policy, preprocess, postprocess, batch) for batch in DataLoader(frames, batch_size)]
+        labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
+        predictions.append(Predictions(labels, chunks))
+    return predictions
+
+
+@torch.inference_mode()
+def _chunks(policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict) -> tuple:
+    """Labels (B, A) and chunks (B, C, A) of a batch."""
+    seen = {name: value for name, value in batch.items() if name.startswith("observation.")} | {"task": batch["task"]}
+    seen = preprocess(seen)
+    try:
+        chunk = policy.predict_action_chunk(seen)
+    except NotImplementedError:
+        policy.reset()  # its queue would answer for the batch before
+        chunk = policy.select_action(seen)[:, None]
+    return batch["action"], postprocess(chunk)
+
+
+def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
+    """The data set with as many observations a frame as the policy was trained on."""
+    times = resolve_delta_timestamps(policy.config, dataset.meta) or {}
+    times = {name: offsets for name, offsets in times.items() if name.startswith("observation.")}
+    if not times:
+        return dataset
+    return LeRobotDataset(dataset.repo_id, root=dataset.root, revision=dataset.revision, delta_timestamps=times)
