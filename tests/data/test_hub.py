@@ -3,15 +3,18 @@
 import multiprocessing
 import os
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 import pytest
 from hub_server import TOKENS, serve
 
+from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.data.hub import pull, push
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
 
 TOKEN = next(iter(TOKENS))
+ENVHUB = Path(__file__).parents[2] / "examples" / "envhub" / "env.py"
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +129,30 @@ def test_a_pull_that_cannot_be_is_one_sentence(hub, machine, pristine):
     assert "no 'alice/private' that this machine may see" in refusal(machine, pull, "alice/private", token=None)
     assert "no revision 'v9.9'" in refusal(machine, pull, "alice/private", "v9.9")
     assert "not in the cache" in refusal(machine, pull, "alice/private", "v3.0", offline=True)
+
+
+def load_envhub(repo_id, file):
+    """Put an `env.py` on the Hub, load it as LeRobot does, and start two environments of the first task."""
+    from huggingface_hub import HfApi
+    from lerobot.envs.factory import make_env
+    from lerobot.envs.utils import close_envs
+
+    HfApi().create_repo(repo_id)
+    HfApi().upload_file(path_or_fileobj=file, path_in_repo="env.py", repo_id=repo_id)
+    with pytest.raises(RuntimeError, match="Refusing to execute remote code"):
+        make_env(repo_id)
+    suites = make_env(repo_id, n_envs=2, trust_remote_code=True)
+    observation, info = suites["bins"][0].reset(seed=[0, 1])
+    shapes = {name: image.shape for name, image in observation["pixels"].items()}
+    close_envs(suites)
+    tasks = {suite: [env.call("task")[0] for env in envs.values()] for suite, envs in suites.items()}
+    return tasks, shapes | {"state": observation["agent_pos"].shape}, list(info["is_success"])
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_lerobots_envhub_loads_every_suite_from_the_hub(machine):
+    tasks, shapes, success = machine(load_envhub, "alice/constructskill", ENVHUB)
+    assert {suite: tuple(names) for suite, names in tasks.items()} == SUITES
+    assert shapes == {"base": (2, 224, 224, 3), "wrist": (2, 224, 224, 3), "state": (2, 8)}
+    assert success == [False, False]
