@@ -6,7 +6,7 @@
 set -euo pipefail
 
 PYTHON_VERSION=3.12
-EXTRAS=sim,offline,cpu,study,distributed,policies,dev
+EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
 # The first Mesa whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device.
 MESA_MINIMUM=24.3
 BACKPORTS_FILE=sources.list.d/constructskill-backports.sources
