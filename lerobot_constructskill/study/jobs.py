@@ -16,6 +16,9 @@ from lerobot_constructskill.study.rollout import Outcome, roll_out
 from lerobot_constructskill.study.rows import Row
 from lerobot_constructskill.study.timing import timed
 
+WITHOUT_DATA = ("no_op", "random", "expert")
+"""References that use no demonstrations, whether or not another job has made them."""
+
 PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "transformers", "numpy")
 
 
@@ -77,7 +80,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> Row:
         evaluation_seed=job.plan.eval_seed,
         episode=0,
         heldout_mse_m2=heldout_error(job, run),
-        dataset_sha256=job.store.dataset_sha256(job.data),
+        dataset_sha256=None if run.variant in WITHOUT_DATA else job.store.dataset_sha256(job.data),
         weights_sha256=hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else None,
         environment_sha256=hashlib.sha256(environment.encode()).hexdigest(),
         backend=backend,

@@ -35,7 +35,7 @@ class Row:
         steps: length of the episode.
         heldout_mse_m2: the run's translation error on held-out demonstrations, in m2.
         error: why the run failed, one sentence; null where it finished. A failed run has one row, episode 0.
-        dataset_sha256: hash of the demonstrations.
+        dataset_sha256: hash of the demonstrations; null for a reference that uses none.
         weights_sha256: hash of the policy's weights.
         environment_sha256: hash of the environment's configuration.
         backend: what rendered and simulated, such as "physx_cpu, cpu rendering".
