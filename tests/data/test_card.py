@@ -94,10 +94,14 @@ def test_the_command_writes_a_card_with_its_pictures(copy, tmp_path):
         assert np.asarray(Image.open(copy / name)).std() > 10
 
 
-@pytest.mark.parametrize("path", sorted(CARDS.glob("*.md")), ids=lambda path: path.stem)
-def test_a_kept_card_is_what_its_facts_render_to(path):
-    facts = json.loads(path.with_suffix(".json").read_text())
-    assert path.read_text() == render(facts)
-    generated = CARDS.parent / "outputs" / path.stem / "demonstrations"
+@pytest.mark.parametrize(
+    "folder", sorted(path.parent for path in CARDS.glob("*/README.md")), ids=lambda path: path.name
+)
+def test_a_kept_card_is_what_its_facts_render_to(folder):
+    facts = json.loads((folder / "facts.json").read_text())
+    card = (folder / "README.md").read_text()
+    assert card == render(facts)
+    assert all((folder / name).is_file() for name in re.findall(r"\((pictures/\w+\.png)\)", card))
+    generated = CARDS.parent / "outputs" / folder.name / "demonstrations"
     if generated.is_dir():
         assert describe(open_dataset(generated)) | {"repo_id": facts["repo_id"]} == facts
