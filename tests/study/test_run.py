@@ -52,12 +52,12 @@ def plan_file(tmp_path_factory, tiny_weights):
     return file
 
 
-def start(plan_file, root, data_root):
+def start(plan_file, root, data_root, *options, **variables):
     command = [sys.executable, "-m", "lerobot_constructskill.scripts.study", f"--config_path={plan_file}"]
     flags = [f"--root={root}", f"--data_root={data_root}", "--workers=1"]
-    quiet = os.environ | {"HF_HUB_OFFLINE": "1"}
+    quiet = os.environ | {"HF_HUB_OFFLINE": "1"} | variables
     log = root.with_suffix(".log").open("a")
-    return subprocess.Popen([*command, *flags], env=quiet, stdout=log, stderr=log, start_new_session=True)
+    return subprocess.Popen([*command, *flags, *options], env=quiet, stdout=log, stderr=log, start_new_session=True)
 
 
 def finish(plan_file, root, data_root):
@@ -99,6 +99,26 @@ def test_the_rows_say_what_happened(undisturbed):
     assert list(failed["variant"]) == ["absent"] * 2 and failed["lifted"].isna().all()
     assert failed["error"].str.contains("/no/such/weights").all()
     assert undisturbed["dataset_sha256"].nunique() == 1 and undisturbed["plan_sha256"].nunique() == 1
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_on_a_cluster_it_ends_as_the_undisturbed_one_though_a_machine_dies(plan_file, undisturbed, tmp_path):
+    pytest.importorskip("ray", reason="the extra `distributed` brings it")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        _, mortal = (cluster.add_node(num_cpus=1) for _ in range(2))
+        ray = ["--executor=ray", "--together=1"]
+        process = start(plan_file, tmp_path / "study", tmp_path / "data", *ray, RAY_ADDRESS=cluster.address)
+        while process.poll() is None and not list(tmp_path.glob(STAGES[1])):
+            time.sleep(0.02)
+        cluster.remove_node(mortal, allow_graceful=False)
+        assert process.wait(timeout=600) == 0, (tmp_path / "study.log").read_text()[-2000:]
+    finally:
+        cluster.shutdown()
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "study" / "rows.parquet"), undisturbed)
 
 
 def plan(**fields):
