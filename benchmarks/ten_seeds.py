@@ -10,7 +10,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.study.plan import Training
-from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
 
 DINOV2 = {"backbone_precision": "bfloat16", "standardize_features": True}  # configs/train/frozen_vit_fast.yaml
 
@@ -19,9 +19,12 @@ def main(folder: Path, n_seeds: int, batch_size: int, weights: str | None = None
     fields = {"backbone": "vit_tiny16", "backbone_path": weights} if weights else DINOV2
     config = FrozenViTChunkConfig(save_backbone=False, device="cpu", **fields)
     dataset = LeRobotDataset("local/features", root=folder / "features")
-    for trained in train_seeds(config, dataset, range(n_seeds), Training(epochs=10, batch_size=batch_size)):
-        save_checkpoint(trained.policy, dataset, folder / "checkpoints" / f"seed_{trained.seed}")
-        print(f"seed {trained.seed}: held-out translation error {trained.heldout_mse_m2:.2e} m2")
+    training = Training(epochs=10, batch_size=batch_size)
+    policies = train_seeds(config, dataset, range(n_seeds), training)
+    errors = heldout_mse(policies, dataset, training.holdout, dataset.meta.stats)
+    for seed, (policy, error) in enumerate(zip(policies, errors, strict=True)):
+        save_checkpoint(policy, dataset, folder / "checkpoints" / f"seed_{seed}")
+        print(f"seed {seed}: held-out translation error {error:.2e} m2")
 
 
 if __name__ == "__main__":

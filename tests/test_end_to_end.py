@@ -16,7 +16,7 @@ from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.study.plan import Training
-from lerobot_constructskill.study.train import train_seeds
+from lerobot_constructskill.study.train import heldout_mse, train_seeds
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -75,7 +75,8 @@ def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reac
     theirs = float(log.split("heldout_translation_mse_m2=")[1].split()[0])
     root, repo_id = (flag.split("=")[1] for flag in features)
     dataset, config = LeRobotDataset(repo_id, root=root), FrozenViTChunkConfig(device="cpu")
-    ours = [one.heldout_mse_m2 for one in train_seeds(config, dataset, range(20), Training(15, 70, holdout=2))]
+    policies = train_seeds(config, dataset, range(20), Training(15, 70, holdout=2))
+    ours = heldout_mse(policies, dataset, 2, dataset.meta.stats)
     middle, spread = np.mean(ours), np.std(ours, ddof=1)
     assert abs(theirs - middle) < 4 * spread < middle, (theirs, ours)
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,12 @@ from lerobot_constructskill.staging import staged
 from lerobot_constructskill.study.plan import Run, StudyPlan, Training
 from lerobot_constructskill.study.prepare import Store
 from lerobot_constructskill.study.timing import timed
-from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
 
 TRAINED = ("blind", "untrained")
 """References that train a policy."""
 
-HELDOUT_FILE = "training.json"
+HELDOUT_FILE = "heldout_mse_m2.json"
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,11 @@ class Job:
         own = None if run.is_reference else self.plan.variants[run.variant].data
         return own or self.plan.settings[run.setting].data
 
+    @property
+    def all_data(self) -> list[str]:
+        """Every configuration of demonstrations in its setting, the setting's own first."""
+        return self.plan.data_of(self.runs[0].setting)
+
     def folder(self, run: Run) -> Path:
         return self.root / "runs" / run.id
 
@@ -63,10 +69,10 @@ def demonstrations(job: Job) -> LeRobotDataset:
         return job.store.demonstrations(job.data)
 
 
-def heldout_error(job: Job, run: Run) -> float | None:
-    """The run's translation error on held-out demonstrations in m2, None where there is none."""
+def heldout_errors(job: Job, run: Run) -> dict[str, float | None]:
+    """The run's translation error in m2 on what its setting holds out of each configuration's demonstrations."""
     file = job.folder(run) / HELDOUT_FILE
-    return json.loads(file.read_text())["heldout_mse_m2"] if file.exists() else None
+    return json.loads(file.read_text()) if file.exists() else {}
 
 
 def train(job: Job) -> None:
@@ -87,17 +93,42 @@ def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training:
     reference = runs[0].variant if runs[0].is_reference else None
     if reference == "untrained":
         policy["backbone_path"] = str(job.store.untrained_weights(policy.get("backbone", "dinov2_vits14")))
-    dataset = demonstrations(job)
-    with timed(job.root, "encoding"):
-        features = job.store.features(dataset, policy, blind=reference == "blind")
+    is_blind = reference == "blind"
+    features = _features(job, job.data, policy, is_blind)
     fields = {name: value for name, value in policy.items() if name != "type"}
     config = draccus.decode(FrozenViTChunkConfig, fields | {"save_backbone": False, "push_to_hub": False})
     with timed(job.root, "training"):
-        trained = train_seeds(config, features, [run.seed for run in runs], training)
-    for run, one in zip(runs, trained, strict=True):
+        policies = train_seeds(config, features, [run.seed for run in runs], training)
+    stats = features.meta.stats
+    errors = {
+        data: heldout_mse(policies, validation, training.holdout, stats)
+        for data, validation in _validation_sets(job, features, policy, is_blind)
+    }
+    for number, run in enumerate(runs):
         with staged(job.folder(run)) as folder:
-            save_checkpoint(one.policy, features, folder / job.checkpoint(run).name)
-            (folder / HELDOUT_FILE).write_text(json.dumps({"heldout_mse_m2": one.heldout_mse_m2}))
+            save_checkpoint(policies[number], features, folder / job.checkpoint(run).name)
+            own = {data: of_all[number] for data, of_all in errors.items()}
+            (folder / HELDOUT_FILE).write_text(json.dumps(own))
+
+
+def _features(job: Job, data: str, policy: dict[str, Any], is_blind: bool) -> LeRobotDataset:
+    with timed(job.root, "demonstrations"):
+        made = job.store.demonstrations(data)
+    with timed(job.root, "encoding"):
+        return job.store.features(made, policy, is_blind)
+
+
+def _validation_sets(
+    job: Job, features: LeRobotDataset, policy: dict[str, Any], is_blind: bool
+) -> Iterator[tuple[str, LeRobotDataset]]:
+    """Yield what its setting validates on, but for sets that cannot be made or lack a column of its own set."""
+    for data in job.all_data:
+        try:
+            other = features if data == job.data else _features(job, data, policy, is_blind)
+        except (OSError, ValueError):
+            continue  # the variant that trains on it says so in its rows
+        if other.meta.features.keys() >= features.meta.features.keys():
+            yield data, other
 
 
 def _train_stock(job: Job, run: Run, policy: dict[str, Any], training: Training) -> None:

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.study.agents import Agent, PolicyAgent
-from lerobot_constructskill.study.checkpoints import TRAINED, Job, demonstrations, heldout_error, train
+from lerobot_constructskill.study.checkpoints import TRAINED, Job, demonstrations, heldout_errors, train
 from lerobot_constructskill.study.film import Film
 from lerobot_constructskill.study.plan import Run
 from lerobot_constructskill.study.references import Blind, Expert, NoOp, Random, Replay
@@ -70,6 +70,7 @@ def _failed(job: Job, run: Run, error: Exception) -> Row:
 def _row(job: Job, run: Run, backend: str | None = None) -> Row:
     """What every row of a run says."""
     model = job.checkpoint(run) / "model.safetensors"
+    errors = heldout_errors(job, run)
     environment = json.dumps({**job.env, "backend": backend}, sort_keys=True)
     return Row(
         plan_sha256=job.plan.sha256,
@@ -79,7 +80,8 @@ def _row(job: Job, run: Run, backend: str | None = None) -> Row:
         training_seed=run.seed,
         evaluation_seed=job.plan.eval_seed,
         episode=0,
-        heldout_mse_m2=heldout_error(job, run),
+        heldout_mse_m2=errors.get(job.plan.settings[run.setting].data),
+        heldout_mse_m2_by_data=json.dumps(errors) if errors else None,
         dataset_sha256=None if run.variant in WITHOUT_DATA else job.store.dataset_sha256(job.data),
         weights_sha256=hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else None,
         environment_sha256=hashlib.sha256(environment.encode()).hexdigest(),

@@ -161,6 +161,15 @@ class StudyPlan:
             for seed in range(seeds)
         ]
 
+    def data_of(self, setting: str) -> list[str]:
+        """Every `constructskill-generate` configuration in a setting, its own first.
+
+        Every policy of the setting is validated on the same demonstrations, those that are held out of each. (The
+        paper validates its policy without noise on demonstrations without noise, section IV.)
+        """
+        variants = [v for v in self.variants.values() if setting in (v.settings or self.settings)]
+        return list(dict.fromkeys([self.settings[setting].data, *(v.data for v in variants if v.data)]))
+
     def variant_of(self, run: Run) -> Variant:
         """What a run trains; `blind` and `untrained` are the first frozen_vit variant, with other eyes.
 

@@ -33,7 +33,8 @@ class Row:
         place_step: first step after which it counted as placed.
         final_error_m: distance of the object from the goal's centre at the end, in metres.
         steps: length of the episode.
-        heldout_mse_m2: the run's translation error on held-out demonstrations, in m2.
+        heldout_mse_m2: the run's translation error on the setting's held-out demonstrations, in m2.
+        heldout_mse_m2_by_data: JSON, the same on every configuration of demonstrations in the setting.
         error: why the run failed, one sentence; null where it finished. A failed run has one row, episode 0.
         dataset_sha256: hash of the demonstrations; null for a reference that uses none.
         weights_sha256: hash of the policy's weights.
@@ -58,6 +59,7 @@ class Row:
     final_error_m: float | None = None
     steps: int | None = None
     heldout_mse_m2: float | None = None
+    heldout_mse_m2_by_data: str | None = None
     error: str | None = None
     dataset_sha256: str | None = None
     weights_sha256: str | None = None

@@ -7,9 +7,9 @@ then train one after another.
 """
 
 from collections.abc import Iterator, Sequence
-from copy import deepcopy
-from dataclasses import dataclass
+from copy import copy, deepcopy
 from pathlib import Path
+from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDataset
@@ -26,19 +26,10 @@ from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import Froze
 from lerobot_constructskill.study.plan import Training
 
 
-@dataclass(frozen=True)
-class Trained:
-    """One seed after training: its policy, and its translation error on held-out demonstrations in m2, if any were."""
-
-    seed: int
-    policy: FrozenViTChunkPolicy
-    heldout_mse_m2: float | None
-
-
 def train_seeds(
     config: FrozenViTChunkConfig, dataset: LeRobotDataset, seeds: Sequence[int], training: Training
-) -> list[Trained]:
-    """Train one policy per seed on a feature set.
+) -> list[FrozenViTChunkPolicy]:
+    """Train one policy per seed on a feature set, and return them in the order of the seeds.
 
     A seed decides the first weights of its heads, as in `lerobot-train --seed`, and the order of its samples. The
     policies share one backbone.
@@ -52,18 +43,34 @@ def train_seeds(
             f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
             "constructskill-encode makes of a data set."
         )
-    table = _read_table(template, dataset)
-    is_heldout = _episodes(dataset) % training.holdout == training.holdout - 1
+    table = _read_table(template, dataset, dataset.meta.stats)
     inputs = _head_inputs(template, table)
-    rows = torch.nonzero(~is_heldout).squeeze(1)
+    rows = torch.nonzero(~_is_heldout(dataset, training.holdout)).squeeze(1)
     heads = [_fresh_heads(template, seed) for seed in seeds]
     orders = [_Order(rows, seed) for seed in seeds]
     at_once = 1 if template.readout.learns else len(seeds)
     for some in (slice(first, first + at_once) for first in range(0, len(seeds), at_once)):
         _step_together(heads[some], template.config, inputs, table, orders[some], training)
-    policies = [_with_heads(template, its_heads) for its_heads in heads]
-    errors = [_heldout_mse(policy, table, is_heldout) for policy in policies]
-    return [Trained(*one) for one in zip(seeds, policies, errors, strict=True)]
+    return [_with_heads(template, its_heads) for its_heads in heads]
+
+
+def heldout_mse(
+    policies: Sequence[FrozenViTChunkPolicy], dataset: LeRobotDataset, holdout: int, stats: dict[str, Any]
+) -> list[float | None]:
+    """Translation error of each policy on the held-out demonstrations of a feature set, in m2; None without any.
+
+    Args:
+        policies: they differ in their heads alone.
+        dataset: any feature set with the inputs of the policies' own, by the same encoder.
+        holdout: every so many-th demonstration is held out, as in `Training`.
+        stats: statistics of the set that they were trained on.
+    """
+    is_heldout = _is_heldout(dataset, holdout)
+    if not is_heldout.any():
+        return [None] * len(policies)
+    table = _read_table(policies[0], dataset, stats)
+    heldout = {name: column[is_heldout] for name, column in table.items()}
+    return [_mean_error(_reading_from(policy, dataset), heldout) for policy in policies]
 
 
 def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folder: Path) -> None:
@@ -84,11 +91,16 @@ class _Order:
         return self.rows[torch.randperm(len(self.rows), generator=self.generator)]
 
 
+def _is_heldout(dataset: LeRobotDataset, holdout: int) -> Tensor:
+    """Which rows (N,) belong to a demonstration that is held out."""
+    return _episodes(dataset) % holdout == holdout - 1
+
+
 def _episodes(dataset: LeRobotDataset) -> Tensor:
     return torch.as_tensor(dataset.hf_dataset.with_format("numpy")["episode_index"][:]).flatten()
 
 
-def _read_table(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> dict[str, Tensor]:
+def _read_table(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, stats: dict[str, Any]) -> dict[str, Tensor]:
     """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T)."""
     columns = dataset.hf_dataset.with_format("numpy")
     names = policy.config.feature_key, "index", *policy.config.input_features
@@ -96,7 +108,7 @@ def _read_table(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> dict[s
     rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
     table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
     table[f"{ACTION}_is_pad"] = rows > last
-    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=stats)
     return {name: value for name, value in preprocess(table).items() if torch.is_tensor(value)}
 
 
@@ -116,11 +128,15 @@ def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tupl
     return torch.cat(pooled), *state
 
 
-def _heldout_mse(policy: FrozenViTChunkPolicy, table: dict[str, Tensor], is_heldout: Tensor) -> float | None:
-    if not is_heldout.any():
-        return None
-    heldout = {name: column[is_heldout] for name, column in table.items()}
-    totals, counts = zip(*(policy.translation_error(rows) for rows in _split(heldout)), strict=True)
+def _reading_from(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> FrozenViTChunkPolicy:
+    """The same policy, which looks for patch features in another data set's folder."""
+    reader = copy(policy)
+    reader.patches_root = dataset.root
+    return reader
+
+
+def _mean_error(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> float:
+    totals, counts = zip(*(policy.translation_error(rows) for rows in _split(table)), strict=True)
     return sum(totals) / sum(counts)
 
 

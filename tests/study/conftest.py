@@ -30,6 +30,16 @@ def tiny_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def feature_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> LeRobotDataset:
+    return write_random_set(tmp_path_factory.mktemp("features") / "set", tiny_weights, seed=0)
+
+
+@pytest.fixture(scope="session")
+def other_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> LeRobotDataset:
+    """Other random numbers by the same encoder."""
+    return write_random_set(tmp_path_factory.mktemp("features") / "other", tiny_weights, seed=1)
+
+
+def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDataset:
     """Eight episodes whose actions are a linear function of random features, and random patch features beside them."""
     spec = BACKBONES[TINY]
     encoder = FrozenEncoder(spec)
@@ -37,14 +47,13 @@ def feature_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) ->
     info = describe(spec, state_sha256(encoder.model.state_dict()), "float32")
     dim = spec.feature_dim
     column = {"dtype": "float32", "shape": (dim,), "names": None, "info": info}
-    root = tmp_path_factory.mktemp("features") / "set"
     features = {
         "observation.features.base": column,
         "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{i}" for i in range(8)]},
         "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
     }
     dataset = LeRobotDataset.create("local/random", fps=20, root=root, features=features)
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     mixing = rng.normal(size=(dim, 4)) / np.sqrt(dim)
     for _ in range(EPISODES):
         for _ in range(LENGTH):

@@ -8,7 +8,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.study.agents import PolicyAgent
 from lerobot_constructskill.study.plan import Training
-from lerobot_constructskill.study.train import save_checkpoint, train_seeds
+from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
 
 TRAINING = Training(epochs=3, batch_size=16, holdout=4)
 FIELDS = [
@@ -59,8 +59,8 @@ def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
     together = train_seeds(config(**fields), feature_set, [3, 0, 7], TRAINING)
     alone = train_alone(config(**fields), feature_set, 0, TRAINING)
     for name, parameter in alone.heads.state_dict().items():
-        torch.testing.assert_close(together[1].policy.heads.state_dict()[name], parameter, atol=1e-6, rtol=1e-4)
-    weights = [trained.policy.heads.translation.weight for trained in together]
+        torch.testing.assert_close(together[1].heads.state_dict()[name], parameter, atol=1e-6, rtol=1e-4)
+    weights = [policy.heads.translation.weight for policy in together]
     assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
 
 
@@ -72,32 +72,38 @@ def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monk
     monkeypatch.setattr(type(bounded), "get_optimizer_preset", lambda self: AdamWConfig(1e-3, grad_clip_norm=1e-3))
     together = train_seeds(bounded, feature_set, [0, 1], TRAINING)
     alone = train_alone(bounded, feature_set, 1, TRAINING)
-    weight = together[1].policy.heads.translation.weight
+    weight = together[1].heads.translation.weight
     torch.testing.assert_close(weight, alone.heads.translation.weight, atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.parametrize("readout", ["cls", "attention"])
-def test_the_held_out_error_is_that_of_every_fourth_episode(readout, config, feature_set):
-    (trained,) = train_seeds(config(readout=readout), feature_set, [0], TRAINING)
-    items = [item for item in chunked(feature_set, trained.policy) if int(item["episode_index"]) in (3, 7)]
-    batch = torch.utils.data.default_collate(items)
-    error = (trained.policy.predict_action_chunk(batch) - batch["action"])[~batch["action_is_pad"]][:, :3]
-    assert trained.heldout_mse_m2 == pytest.approx(error.pow(2).mean().item(), rel=1e-5)
+@pytest.mark.parametrize("fields", [{}, {"use_state": True}, {"readout": "attention"}], ids=str)
+@pytest.mark.parametrize("validation", ["feature_set", "other_set"])
+def test_the_held_out_error_is_that_of_every_fourth_episode(validation, fields, config, feature_set, request):
+    """Of the training set or of another, which is normalised as the training set was."""
+    policies = train_seeds(config(**fields), feature_set, [0], TRAINING)
+    dataset, stats = request.getfixturevalue(validation), feature_set.meta.stats
+    (measured,) = heldout_mse(policies, dataset, TRAINING.holdout, stats)
+    items = [item for item in chunked(dataset, policies[0]) if int(item["episode_index"]) in (3, 7)]
+    preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=stats)
+    batch = preprocess(torch.utils.data.default_collate(items))
+    policies[0].patches_root = dataset.root
+    error = (policies[0].predict_action_chunk(batch) - batch["action"])[~batch["action_is_pad"]][:, :3]
+    assert measured == pytest.approx(error.pow(2).mean().item(), rel=1e-5)
 
 
 def test_without_a_held_out_episode_there_is_no_error(config, feature_set):
-    (trained,) = train_seeds(config(), feature_set, [0], Training(epochs=1, batch_size=16, holdout=100))
-    assert trained.heldout_mse_m2 is None
+    policies = train_seeds(config(), feature_set, [0], Training(epochs=1, batch_size=16, holdout=100))
+    assert heldout_mse(policies, feature_set, 100, feature_set.meta.stats) == [None]
 
 
 def test_a_checkpoint_is_lerobots_own_and_acts_alike(config, feature_set, tmp_path):
     trained = train_seeds(config(use_state=True), feature_set, [0, 1], TRAINING)
-    for one in trained:
-        save_checkpoint(one.policy, feature_set, tmp_path / str(one.seed))
-    for one in trained:
-        loaded = PolicyAgent.from_pretrained(tmp_path / str(one.seed), "cpu").policy
-        assert loaded.config.input_features == one.policy.config.input_features
-        for name, tensor in one.policy.state_dict().items():
+    for seed, policy in enumerate(trained):
+        save_checkpoint(policy, feature_set, tmp_path / str(seed))
+    for seed, policy in enumerate(trained):
+        loaded = PolicyAgent.from_pretrained(tmp_path / str(seed), "cpu").policy
+        assert loaded.config.input_features == policy.config.input_features
+        for name, tensor in policy.state_dict().items():
             assert torch.equal(loaded.state_dict()[name], tensor)
 
 
