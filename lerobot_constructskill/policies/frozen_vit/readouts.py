@@ -13,6 +13,11 @@ QUERIES = 4
 """Learned queries of `attention`."""
 
 
+def _keep(dim: int) -> nn.Module:
+    """What is pooled is the vector."""
+    return nn.Identity()
+
+
 @dataclass(frozen=True)
 class Readout:
     """What the heads see of an image.
@@ -22,14 +27,17 @@ class Readout:
         build: `D -> module` that trains with the heads and makes one vector of what `pool` took.
         dim: `D -> length` of that vector.
         reads_patches: whether `pool` looks at the patches at all.
-        learns: whether the module has parameters, so that what it returns changes in training.
     """
 
     pool: Callable[[Tensor, Tensor], Tensor]
     dim: Callable[[int], int]
-    build: Callable[[int], nn.Module] = lambda dim: nn.Identity()
+    build: Callable[[int], nn.Module] = _keep
     reads_patches: bool = True
-    learns: bool = False
+
+    @property
+    def learns(self) -> bool:
+        """Whether the module has parameters, so that what it returns changes in training."""
+        return self.build is not _keep
 
 
 class SpatialSoftmax(nn.Module):
@@ -83,8 +91,6 @@ READOUTS = {
     "cls": Readout(lambda cls, patches: cls, lambda dim: dim, reads_patches=False),
     "mean": Readout(lambda cls, patches: patches.mean(dim=1), lambda dim: dim),
     "cls_mean": Readout(lambda cls, patches: torch.cat([cls, patches.mean(dim=1)], dim=-1), lambda dim: 2 * dim),
-    "spatial_softmax": Readout(
-        lambda cls, patches: patches, lambda dim: 2 * KEYPOINTS, build=SpatialSoftmax, learns=True
-    ),
-    "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, build=AttentionPooling, learns=True),
+    "spatial_softmax": Readout(lambda cls, patches: patches, lambda dim: 2 * KEYPOINTS, SpatialSoftmax),
+    "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, AttentionPooling),
 }
