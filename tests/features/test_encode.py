@@ -153,6 +153,22 @@ def test_the_policy_trains_on_features_and_declares_the_camera(encoded, weights)
     assert batch[KEY].shape == (4, 192) and batch["action_is_pad"].any() and torch.isfinite(loss)
 
 
+def test_a_crop_is_all_that_is_encoded_and_the_policys_must_be_the_same(source, weights, tmp_path):
+    crop = [0.25, 0.5, 0.75, 1.0]
+    encode(settings(source, weights, tmp_path / "out", crop=crop))
+    dataset = LeRobotDataset("local/out", root=tmp_path / "out")
+    policy = make_policy(policy_config(weights, crop=crop), ds_meta=dataset.meta)
+    images = torch.stack([source[i]["observation.images.base"] for i in range(3)])
+    seen = policy.predict_action_chunk({"observation.images.base": images})
+    features = torch.stack([dataset[i][KEY] for i in range(3)])
+    torch.testing.assert_close(policy.predict_action_chunk({KEY: features}), seen, atol=1e-4, rtol=1e-2)
+    outside = images.clone()
+    outside[..., : images.shape[-2] // 2, :] = 0
+    torch.testing.assert_close(policy.predict_action_chunk({"observation.images.base": outside}), seen)
+    with pytest.raises(ValueError, match="crop"):
+        make_policy(policy_config(weights), ds_meta=dataset.meta)
+
+
 def test_a_readout_of_patches_trains_on_a_set_that_has_them(source, encoded, weights, tmp_path):
     policy_fields = policy_config(weights, readout="mean")
     with pytest.raises(FileNotFoundError, match="--patches=true"):

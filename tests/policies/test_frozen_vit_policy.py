@@ -10,7 +10,12 @@ from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLE
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS, SpatialSoftmax
 
 ABLATIONS = [{}, {"chunk_size": 1}, {"temporal_ensemble_coeff": None}, {"gripper_head": "regression"}]
-OTHER = [{"use_state": True}, {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]}, {"regression_weight": 100.0}]
+OTHER = [
+    {"use_state": True},
+    {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]},
+    {"regression_weight": 100.0},
+    {"head_hidden_dim": 64},
+]
 VARIANTS = [*ABLATIONS, *OTHER, *({"readout": name, "use_state": True} for name in READOUTS)]
 
 

@@ -17,6 +17,7 @@ FIELDS = [
     {"gripper_head": "regression"},
     {"use_state": True},
     {"standardize_features": True},
+    {"head_hidden_dim": 32},
     {"regression_weight": 100.0, "scheduler_warmup_steps": 4},
     *({"readout": name, "use_state": readout.learns} for name, readout in READOUTS.items() if name != "cls"),
 ]
@@ -60,7 +61,7 @@ def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
     alone = train_alone(config(**fields), feature_set, 0, TRAINING)
     for name, parameter in alone.heads.state_dict().items():
         torch.testing.assert_close(together[1].heads.state_dict()[name], parameter, atol=1e-6, rtol=1e-4)
-    weights = [policy.heads.translation.weight for policy in together]
+    weights = [next(policy.heads.translation.parameters()) for policy in together]
     assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
 
 

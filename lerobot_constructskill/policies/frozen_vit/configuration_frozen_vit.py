@@ -39,6 +39,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
+        crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
+            height (0 to 1); None takes it all, as the paper does. On a feature set, the one it was encoded with.
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
             ("spatial_softmax"), or what a few learned queries find ("attention"). On a feature set all but the
@@ -49,6 +51,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             those that LeRobot computes, of the whole data set, episodes held out for evaluation included. For
             the readout "cls" alone.
         use_state: whether the heads also see the normalised `observation.state`.
+        head_hidden_dim: width of a hidden layer (GELU) in each of the two heads; None makes them linear, as the
+            paper does.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
         action_scale: bound of the regression head, `action_scale * tanh(.)`, in metres (and radians).
@@ -83,9 +87,11 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_precision: str = "float32"
     save_backbone: bool = True
     camera: str = "base"
+    crop: list[float] | None = None
     readout: str = "cls"
     standardize_features: bool = False
     use_state: bool = False
+    head_hidden_dim: int | None = None
 
     action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
     action_scale: float = 0.1
@@ -105,6 +111,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         _check_choice("backbone_precision", self.backbone_precision, PRECISIONS)
         _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)
         _check_choice("readout", self.readout, tuple(READOUTS))
+        _check_crop(self.crop)
         if self.standardize_features and self.readout != "cls":
             raise ValueError(
                 f"standardize_features serves readout=cls alone, got readout={self.readout}: the statistics of a "
@@ -126,6 +133,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             )
         if self.scheduler_warmup_steps is not None and self.scheduler_warmup_steps < 0:
             raise ValueError(f"scheduler_warmup_steps must be at least 0, got {self.scheduler_warmup_steps}.")
+        if self.head_hidden_dim is not None and self.head_hidden_dim < 1:
+            raise ValueError(f"head_hidden_dim must be at least 1, got {self.head_hidden_dim}.")
         if self.regression_weight <= 0:
             raise ValueError(f"regression_weight must be above 0, got {self.regression_weight}.")
         if self.action_scale <= 0:
@@ -208,6 +217,17 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"{field_name} must be one of {', '.join(choices)}, got '{value}'.")
+
+
+def _check_crop(crop: Any) -> None:
+    if crop is None:
+        return
+    left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
+    if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+        raise ValueError(
+            f"crop must be left, top, right and bottom in shares of the image, such as [0.25, 0.25, 0.75, 0.75]; "
+            f"got {crop}."
+        )
 
 
 def _check_action_names(names: Any) -> None:

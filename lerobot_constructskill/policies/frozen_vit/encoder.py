@@ -1,5 +1,6 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,6 +12,9 @@ from .backbones import IMAGE_SIZE, Backbone
 
 PRECISIONS = ("float32", "bfloat16")
 
+Crop = Sequence[float]
+"""Left, top, right and bottom edge of the part of an image that is looked at, in shares of its width and height."""
+
 
 class FrozenEncoder(nn.Module):
     """A backbone without gradients, in evaluation mode whatever `train()` says.
@@ -19,12 +23,14 @@ class FrozenEncoder(nn.Module):
         backbone: the registry entry to build, with random weights until a state dict is loaded into `model`.
         precision: "float32" (PyTorch), or "bfloat16" (features stay float32): autocast, and on a CPU OpenVINO where
             it is installed.
+        crop: the part of every image that is encoded; None takes it all. The patches of a part are finer.
     """
 
-    def __init__(self, backbone: Backbone, precision: str = "float32"):
+    def __init__(self, backbone: Backbone, precision: str = "float32", crop: Crop | None = None):
         super().__init__()
         self.spec = backbone
         self.precision = precision
+        self.crop = crop
         # Heads drawn after this one must not depend on how many numbers a backbone's own initialisation took.
         with torch.random.fork_rng(devices=[]):
             self.model = backbone.build()
@@ -72,8 +78,13 @@ class FrozenEncoder(nn.Module):
         return pooled.float(), patches.float()
 
     def preprocess(self, images: Tensor) -> Tensor:
-        """Resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
+        """Crop, resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
         images = images.float()
+        if self.crop is not None:
+            (height, width), (left, top, right, bottom) = images.shape[-2:], self.crop
+            images = images[
+                ..., round(top * height) : round(bottom * height), round(left * width) : round(right * width)
+            ]
         if images.shape[-2:] != (IMAGE_SIZE, IMAGE_SIZE):
             size = (IMAGE_SIZE, IMAGE_SIZE)
             images = F.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)

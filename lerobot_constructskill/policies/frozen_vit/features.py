@@ -1,6 +1,6 @@
 """Feature sets: data sets that carry an encoder's output in place of video, and say whose output it is."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -44,17 +44,20 @@ def _mapped(file: Path) -> Tensor:
     return torch.from_numpy(np.load(file, mmap_mode="c"))  # torch takes no read-only memory
 
 
-def describe(backbone: Backbone, weights_sha256: str, precision: str) -> dict[str, str]:
+def describe(
+    backbone: Backbone, weights_sha256: str, precision: str, crop: Sequence[float] | None = None
+) -> dict[str, str]:
     """Say how features are made: the column's `info`, compared before a policy trains on them."""
+    resize = f"bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size"
+    pixels = ["[0, 1]", resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
+    if crop is not None:
+        pixels.insert(1, f"crop {list(crop)}")
     return {
         "backbone": backbone.name,
         "weights_sha256": weights_sha256,
         "precision": precision,
         "readout": backbone.readout,
-        "preprocessing": (
-            f"[0, 1], bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size, "
-            f"mean {list(backbone.mean)}, std {list(backbone.std)}"
-        ),
+        "preprocessing": ", ".join(pixels),
     }
 
 

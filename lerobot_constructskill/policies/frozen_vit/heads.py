@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class ChunkHeads(nn.Module):
-    """Two linear layers that share no weights (paper, section II), on one vector.
+    """Two heads that share no weights (paper, section II), on one vector: linear, or with a hidden layer each.
 
     Args:
         readout: makes that vector of what was pooled of the tokens; it may have parameters of its own.
@@ -16,15 +16,24 @@ class ChunkHeads(nn.Module):
         chunk_size: steps T predicted at once.
         n_regressed: translations (and rotations) R of an action; the gripper makes A = R + 1.
         action_scale: bound of the regression, in metres (and radians).
+        hidden_dim: width of the hidden layer, None for none.
     """
 
-    def __init__(self, readout: nn.Module, input_dim: int, chunk_size: int, n_regressed: int, action_scale: float):
+    def __init__(
+        self,
+        readout: nn.Module,
+        input_dim: int,
+        chunk_size: int,
+        n_regressed: int,
+        action_scale: float,
+        hidden_dim: int | None = None,
+    ):
         super().__init__()
         self.chunk_shape = (chunk_size, n_regressed)
         self.action_scale = action_scale
         self.readout = readout
-        self.translation = nn.Linear(input_dim, chunk_size * n_regressed)
-        self.gripper = nn.Linear(input_dim, chunk_size)
+        self.translation = _head(input_dim, hidden_dim, chunk_size * n_regressed)
+        self.gripper = _head(input_dim, hidden_dim, chunk_size)
 
     def forward(self, pooled: Tensor, state: Tensor | None = None) -> Tensor:
         """Return (B, T, A) for pooled tokens (B, ...): bounded translations, then the gripper's logit or number."""
@@ -33,6 +42,12 @@ class ChunkHeads(nn.Module):
             inputs = torch.cat([inputs, state], dim=-1)
         regressed = self.translation(inputs).unflatten(-1, self.chunk_shape)
         return torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
+
+
+def _head(input_dim: int, hidden_dim: int | None, output_dim: int) -> nn.Module:
+    if hidden_dim is None:
+        return nn.Linear(input_dim, output_dim)
+    return nn.Sequential(nn.Linear(input_dim, hidden_dim), nn.GELU(), nn.Linear(hidden_dim, output_dim))
 
 
 class ChunkErrors(NamedTuple):

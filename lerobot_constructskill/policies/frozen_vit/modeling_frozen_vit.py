@@ -58,11 +58,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config = config
         spec = get_backbone(config.backbone)
-        self.backbone = FrozenEncoder(spec, config.backbone_precision)
+        self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop)
         if load_backbone:
             self._load_backbone()
         if config.feature_column is not None:
-            expected = describe(spec, config.backbone_sha256, config.backbone_precision)
+            expected = describe(spec, config.backbone_sha256, config.backbone_precision, config.crop)
             check_features(config.feature_column, expected, spec.feature_dim)
         self.readout = READOUTS[config.readout]
         self.patches_root = dataset_meta.root if dataset_meta is not None else None
@@ -85,8 +85,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """Return heads with newly drawn weights."""
         config, dim = self.config, self.backbone.spec.feature_dim
         state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
-        sizes = self.readout.dim(dim) + state_dim, config.chunk_size, len(config.action_names) - 1
-        return ChunkHeads(self.readout.build(dim), *sizes, config.action_scale)
+        return ChunkHeads(
+            self.readout.build(dim),
+            self.readout.dim(dim) + state_dim,
+            config.chunk_size,
+            len(config.action_names) - 1,
+            config.action_scale,
+            config.head_hidden_dim,
+        )
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
