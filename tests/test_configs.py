@@ -34,8 +34,8 @@ def generate_config(path: Path) -> GenerateConfig:
 @pytest.mark.parametrize("path", GENERATE, ids=lambda path: path.stem)
 def test_generation_configs_are_the_papers(path):
     config = generate_config(path)
-    assert config.task == ("brick_to_bin_shifted" if path.stem.endswith("shifted") else "brick_to_bin")
-    assert config.episodes == (2 if path.stem == "smoke" else 80)
+    assert config.task == ("brick_to_bin_shifted" if "shifted" in path.stem else "brick_to_bin")
+    assert config.episodes == {"smoke": 2, "fast_shifted_320": 320}.get(path.stem, 80)
     assert config.noise.root[0, 0] == (0.0 if path.stem.endswith("noise_free") else 0.01)
 
 
