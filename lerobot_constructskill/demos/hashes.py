@@ -1,18 +1,13 @@
 """SHA-256 of a data set's files, by which a later change is seen and two data sets are compared."""
 
-import hashlib
 from pathlib import Path
 
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.hashing import file_sha256
 
 
 def file_hashes(root: Path) -> dict[str, str]:
     """Hashes of frames, videos and metadata by relative path; the record that they stand in is left out."""
     paths = (path for folder in ("data", "videos", "meta") for path in sorted((root / folder).rglob("*.*")))
     names = (path.relative_to(root).as_posix() for path in paths if path.is_file())
-    return {name: _sha256(root / name) for name in names if name != SIDECAR}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return {name: file_sha256(root / name) for name in names if name != SIDECAR}

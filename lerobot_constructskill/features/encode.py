@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +18,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
@@ -71,7 +73,9 @@ def write_feature_set(
     Raises:
         ValueError: the data set has no such camera.
     """
-    parts = _parts_folder(folder, dataset, camera, {**info, "encoder": type(encoder).__name__}, patches)
+    info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
+    made_of = {**info, "camera": camera, "encoder": type(encoder).__name__, "patches": patches}
+    parts = _parts_folder(folder, made_of)
     features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
     _write_copy(dataset, camera, features, info, repo_id, folder)
     if patches:
@@ -99,12 +103,11 @@ def _encode_frames(
     return np.concatenate([np.load(_part(parts, episode)) for episode in dataset.meta.episodes])
 
 
-def _parts_folder(folder: Path, dataset: LeRobotDataset, camera: str, info: dict[str, str], patches: bool) -> Path:
+def _parts_folder(folder: Path, made_of: dict[str, Any]) -> Path:
     """Where the finished episodes of a feature set lie that is being written to `folder`.
 
     Nothing that was made otherwise is ever taken for a part: what they are made of is in the folder's name.
     """
-    made_of = {**info, "camera": camera, "source": data_sha256(dataset.root), "patches": patches}
     return folder.with_name(PARTS) / hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -134,7 +137,6 @@ def _write_copy(
     dataset: LeRobotDataset, camera: str, features: np.ndarray, info: dict[str, str], repo_id: str, folder: Path
 ) -> None:
     key = feature_key(camera)
-    info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
     column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}
     copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), folder, repo_id)
     stats = compute_episode_stats({key: features}, {key: column})
@@ -146,16 +148,6 @@ def _left_out(dataset: LeRobotDataset) -> list[str]:
     read = [name for name in dataset.meta.features if name.startswith(("observation.", "action"))]
     kept = set(read) - set(dataset.meta.camera_keys) | set(DEFAULT_FEATURES)
     return [name for name in dataset.meta.features if name not in kept]
-
-
-def data_sha256(root: Path) -> str:
-    """Hash the frames and videos of a data set: relative paths and bytes, in the order of the paths."""
-    digest = hashlib.sha256()
-    for path in sorted(p for folder in ("data", "videos") for p in (root / folder).rglob("*") if p.is_file()):
-        digest.update(path.relative_to(root).as_posix().encode())
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
 
 
 def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) -> Iterator[Tensor]:

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from glob import glob
 from pathlib import Path
 
+from lerobot_constructskill.hashing import data_sha256, file_sha256
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.staging import replaced
 
@@ -46,7 +47,6 @@ def evaluate_offline(config: OfflineConfig) -> str:
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_constructskill.demos.dart import held_out
-    from lerobot_constructskill.features.encode import data_sha256
 
     checkpoints = _find(config.policies)
     dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)
@@ -91,20 +91,13 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
         "training_seed": _training_seed(checkpoint),
         **asdict(metrics),
         "checkpoint": str(checkpoint),
-        "weights_sha256": _sha256(checkpoint / "model.safetensors"),
+        "weights_sha256": file_sha256(checkpoint / "model.safetensors"),
     }
 
 
 def _training_seed(checkpoint: Path) -> int | None:
     path = checkpoint / "train_config.json"
     return json.loads(path.read_text()).get("seed") if path.is_file() else None
-
-
-def _sha256(path: Path) -> str:
-    import hashlib
-
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _write(rows: list[dict], folder: Path) -> str:

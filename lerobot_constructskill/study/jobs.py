@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib.metadata import version
 
 from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.hashing import file_sha256
 from lerobot_constructskill.study.agents import Agent, PolicyAgent
 from lerobot_constructskill.study.checkpoints import TRAINED, Job, demonstrations, heldout_errors, train
 from lerobot_constructskill.study.film import Film
@@ -83,7 +84,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> Row:
         heldout_mse_m2=errors.get(job.plan.settings[run.setting].data),
         heldout_mse_m2_by_data=json.dumps(errors) if errors else None,
         dataset_sha256=None if run.variant in WITHOUT_DATA else job.store.dataset_sha256(job.data),
-        weights_sha256=hashlib.sha256(model.read_bytes()).hexdigest() if model.exists() else None,
+        weights_sha256=file_sha256(model) if model.exists() else None,
         environment_sha256=hashlib.sha256(environment.encode()).hexdigest(),
         backend=backend,
         versions=json.dumps({name: version(name) for name in PACKAGES}),

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from lerobot_constructskill.demos.recorder import record
 from lerobot_constructskill.demos.settings import GenerateConfig, provenance
-from lerobot_constructskill.features.encode import PARTS, data_sha256, load_encoder, write_feature_set
+from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
+from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
