@@ -198,6 +198,14 @@ def test_a_planted_corruption_is_found_and_named(name, copy):
         raise ValueError(" ".join(found))
 
 
+def test_an_axis_that_is_hardly_asked_for_has_no_response_to_judge(copy):
+    """A mirrored x is found, but not where the arm was told next to nothing in x, and moved by its own sag."""
+    column("observation.state", lambda state: state * [-1, *[1] * 7])(copy)
+    assert any("in x for a metre" in found for found in complaints(open_dataset(copy), CHECKS["Units"]))
+    column("dart.executed_action", lambda action: action * [1e-3, *[1] * 3])(copy)
+    assert complaints(open_dataset(copy), CHECKS["Units"]) == []
+
+
 def test_every_check_has_its_corruption():
     assert {check for _, check, _ in CORRUPTIONS.values()} == set(CHECKS)
 
