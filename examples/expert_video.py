@@ -11,7 +11,8 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
-from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.demos.demonstrate import watch
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 SIDE = 224
@@ -20,18 +21,10 @@ SIDE = 224
 def main(task: str = "brick_to_bin", folder: str = "outputs") -> None:
     expert = make_expert(get_task(task), ExpertConfig())
     env = ConstructSkillEnv(task)
-    obs, _ = env.reset(seed=DEMO_SEED_START)
-    state = PrivilegedState(**env.privileged_state())
-    progress, film, sheet = expert.start(state), [], {}
-    while progress is not None:
-        action, phase, progress = expert.act(state, progress)
+    film, sheet = [], {}
+    for phase, obs in watch(env, expert, DEMO_SEED_START):
         film.append(env.render())
-        sheet.setdefault(phase, (obs["pixels"]["base"], film[-1]))
-        obs, _, placed, _, _ = env.step(action)
-        state = PrivilegedState(**env.privileged_state())
-        if placed:
-            break
-    sheet["placed"] = (obs["pixels"]["base"], env.render())
+        sheet.setdefault(phase or "end", (obs["pixels"]["base"], film[-1]))
     env.close()
     path = Path(folder) / f"{task}.mp4"
     path.parent.mkdir(parents=True, exist_ok=True)

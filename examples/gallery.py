@@ -11,7 +11,8 @@ from PIL import Image
 from tqdm import tqdm
 
 from lerobot_constructskill.contract import DEMO_SEED_START, TASKS, Task
-from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.demos.demonstrate import watch
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 SIDE = 224
@@ -26,16 +27,11 @@ def main(folder: str = "examples/pictures") -> None:
 def film(task: Task) -> list[np.ndarray]:
     """What the policy sees at the start, and the expert's demonstration at half time and at its end."""
     env, expert = ConstructSkillEnv(task.name), make_expert(task, ExpertConfig())
-    obs, _ = env.reset(seed=DEMO_SEED_START)
-    state = PrivilegedState(**env.privileged_state())
-    progress, placed, close_ups = expert.start(state), False, []
-    while progress is not None and not placed:
-        action, _, progress = expert.act(state, progress)
-        _, _, placed, _, _ = env.step(action)
-        close_ups.append(env.render())
-        state = PrivilegedState(**env.privileged_state())
+    seen, close_ups = zip(
+        *((obs["pixels"]["base"], env.render()) for _, obs in watch(env, expert, DEMO_SEED_START)), strict=True
+    )
     env.close()
-    return [obs["pixels"]["base"], close_ups[len(close_ups) // 2], close_ups[-1]]
+    return [seen[0], close_ups[len(close_ups) // 2], close_ups[-1]]
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
 """One demonstration: an expert drives an environment through noise, and every frame is kept."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from lerobot_constructskill.contract import CAMERAS
-from lerobot_constructskill.demos.expert import Expert, PrivilegedState
+from lerobot_constructskill.demos.expert import Expert, Phase, PrivilegedState
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
@@ -51,3 +52,20 @@ def demonstrate(
             }
         )
     return frames, success
+
+
+def watch(env: ConstructSkillEnv, expert: Expert, seed: int) -> Iterator[tuple[Phase | None, dict[str, Any]]]:
+    """Run one attempt without noise and stop at every step, for whoever wants to look at it.
+
+    Yields:
+        The phase that comes next, and the observation; at the end None in place of a phase.
+    """
+    obs, _ = env.reset(seed=seed)
+    state = PrivilegedState(**env.privileged_state())
+    progress, is_over = expert.start(state), False
+    while progress is not None and not is_over:
+        action, phase, progress = expert.act(state, progress)
+        yield phase, obs
+        obs, _, success, truncated, _ = env.step(action)
+        state, is_over = PrivilegedState(**env.privileged_state()), success or truncated
+    yield None, obs

@@ -88,21 +88,16 @@ def save_contact_sheet(config: CheckConfig) -> Path:
     import numpy as np
     from PIL import Image
 
-    from lerobot_constructskill.demos.expert import PrivilegedState, make_expert
+    from lerobot_constructskill.demos.demonstrate import watch
+    from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
     env = ConstructSkillEnv(config.task)
     expert = make_expert(get_task(config.task), config.expert)
-    obs, _ = env.reset(seed=DEMO_SEED_START)
-    state = PrivilegedState(**env.privileged_state())
-    progress, over, columns = expert.start(state), False, {}
-    while progress is not None and not over:
-        action, phase, progress = expert.act(state, progress)
+    columns = {}
+    for phase, obs in watch(env, expert, DEMO_SEED_START):
         if phase not in columns:
             columns[phase] = (obs["pixels"]["base"], env.render())
-        obs, _, success, truncated, _ = env.step(action)
-        state, over = PrivilegedState(**env.privileged_state()), success or truncated
-    columns["end"] = (obs["pixels"]["base"], env.render())
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"
