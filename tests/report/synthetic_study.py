@@ -1,5 +1,6 @@
 """A study that was never run: deterministic rows for a plan, in the shapes that real rows come in."""
 
+import json
 from pathlib import Path
 
 import draccus
@@ -27,7 +28,9 @@ PLAN = StudyPlan(
         "vit_tiny": Variant(policy=VIT, label="ViT-Tiny/16"),
         "augreg": Variant(policy=VIT, label="ViT-Tiny (AugReg)", settings=["fixed"]),
         "no_chunk": Variant(policy=VIT, seeds=3, label="No action chunking"),
-        "noise_free": Variant(policy=VIT, seeds=3, label="No noise injection"),
+        "noise_free": Variant(
+            policy=VIT, seeds=3, label="No noise injection", data="configs/generate/fast_noise_free.yaml"
+        ),
     },
     references={"no_op": 1, "random": 10, "replay": 10, "blind": 10, "expert": 1},
 )
@@ -86,7 +89,9 @@ def study_rows(plan: StudyPlan = PLAN) -> list[Row]:
         lifted = plan.episodes * (rng.random() < lifts) if share == 1 else rng.binomial(plan.episodes, lifts * share)
         placed = lifted * (rng.random() < places) if share == 1 else rng.binomial(lifted, places * share)
         mse = error * rng.uniform(0.95, 1.08)
-        rows += episode_rows(plan, run.setting, run.variant, run.seed, lifted, placed, heldout_mse_m2=mse)
+        by_data = json.dumps({data: mse / (i + 1) for i, data in enumerate(plan.data_of(run.setting))})
+        errors = {"heldout_mse_m2": mse, "heldout_mse_m2_by_data": by_data}
+        rows += episode_rows(plan, run.setting, run.variant, run.seed, lifted, placed, **errors)
     for setting in plan.settings:
         for reference in plan.references:
             solved = plan.episodes * REFERENCE_SKILL[reference] * (1 if setting == "fixed" else 0.1)

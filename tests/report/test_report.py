@@ -58,6 +58,17 @@ def test_page_holds_the_papers_tables_and_every_figure(study):
     assert reader.tags.count("img") == len(names) + 1
 
 
+def test_every_variant_is_validated_on_every_set_of_the_setting(study):
+    markdown = (study / "report.md").read_text()
+    fixed, moved = (part for part in markdown.split("Error on what is held out of each set")[1:])
+    for part in (fixed, moved):
+        assert "| configuration | trained on | fast | fast\\_noise\\_free |\n|---|---|---:|---:|\n" in part
+    (row,) = [line for line in fixed.splitlines() if line.startswith("| No noise injection | fast\\_noise\\_free |")]
+    on_noisy, on_noise_free = (float(cell.split("[")[0].replace("\\", "")) for cell in row.split("|")[3:5])
+    assert on_noise_free == pytest.approx(on_noisy / 2, abs=0.01)
+    assert "fast_noise_free" in (study / "report.html").read_text()
+
+
 def test_page_is_one_file_without_script(study):
     reader = Reader((study / "report.html").read_text())
     assert "script" not in reader.tags and "table" in reader.tags

@@ -208,7 +208,8 @@ def test_kendall_needs_errors_and_outcomes_that_differ(rng):
 
 
 def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion():
-    episode = {"setting": "s", "variant": "v", "is_reference": False, "heldout_mse_m2": 1e-4, "error": None}
+    episode = {"setting": "s", "variant": "v", "is_reference": False, "error": None}
+    episode |= {"heldout_mse_m2": 1e-4, "heldout_mse_m2_by_data": None}
     rows = [episode | {"training_seed": 0, "lifted": True, "placed": index > 0} for index in range(2)]
     rows.append(episode | {"training_seed": 1, "lifted": None, "placed": None, "error": "Out of memory."})
     table = pd.DataFrame(rows).astype({"lifted": "boolean", "placed": "boolean", "error": "string"})

@@ -1,5 +1,6 @@
 """A plan and its rows in, everything a report says out, as numbers."""
 
+import json
 from itertools import groupby
 
 import numpy as np
@@ -118,15 +119,21 @@ def _variants_of(plan: StudyPlan, setting: str) -> list[str]:
 def _line(name: str, label: str | None, seeds: int | None, runs: pd.DataFrame, rng: np.random.Generator) -> Line:
     own = runs[runs["variant"] == name]
     finished = own["error"].isna().any()
-    errors = own["heldout_mse_m2"].dropna()
+    by_data = pd.DataFrame([json.loads(errors) for errors in own["heldout_mse_m2_by_data"].dropna()])
     return Line(
         name=name,
         label=label or name,
         seeds=len(own) if seeds is None else seeds,
         runs=own,
         outcomes={criterion: _outcome(own, criterion, rng) for criterion in CRITERIA} if finished else {},
-        error=Estimate(*map(float, (errors.mean(), errors.min(), errors.max()))) if len(errors) else None,
+        error=_mean_and_range(own["heldout_mse_m2"]),
+        errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
     )
+
+
+def _mean_and_range(errors: pd.Series) -> Estimate | None:
+    known = errors.dropna().astype(float)
+    return Estimate(*map(float, (known.mean(), known.min(), known.max()))) if len(known) else None
 
 
 def _outcome(runs: pd.DataFrame, criterion: str, rng: np.random.Generator) -> Outcome:

@@ -39,6 +39,7 @@ class Line:
         outcomes: criterion to outcome; empty where no run finished without an error, so that policies that could
             not be had never look like zeros.
         error: held-out error in m2, mean with its range over seeds; None without any.
+        errors_by_data: the same on the demonstrations of each configuration in the setting.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Line:
     runs: pd.DataFrame
     outcomes: dict[str, Outcome]
     error: Estimate | None
+    errors_by_data: dict[str, Estimate | None]
 
     @property
     def failed(self) -> int:

@@ -1,6 +1,7 @@
 """Numbers as a report writes them. Every function takes numbers and gives plain text."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from lerobot_constructskill.study.stats.intervals import Estimate
 
@@ -88,6 +89,11 @@ def plural(n: int, noun: str) -> str:
 def listed(items: Sequence[str]) -> str:
     """ "a, b and c"."""
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
+
+
+def stem(path: str) -> str:
+    """What tables call a configuration file."""
+    return Path(path).stem
 
 
 def roman(number: int) -> str:

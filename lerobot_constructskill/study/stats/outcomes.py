@@ -35,8 +35,8 @@ def seed_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         The columns of `RUN`; `episodes` that were run; `lifted` and `placed`, episodes that met the criterion;
-        `lifted_rate` and `placed_rate`, their share in [0, 1], 0 where the run failed; `heldout_mse_m2`; `error`, the
-        reason of a failed run, else null.
+        `lifted_rate` and `placed_rate`, their share in [0, 1], 0 where the run failed; `heldout_mse_m2`;
+        `heldout_mse_m2_by_data`, as in the rows; `error`, the reason of a failed run, else null.
     """
     groups = rows.groupby(RUN, sort=True)
     runs = pd.DataFrame({"episodes": groups["placed"].count()})
@@ -44,6 +44,7 @@ def seed_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
         runs[criterion] = groups[criterion].sum().astype(int)
         runs[f"{criterion}_rate"] = (runs[criterion] / runs["episodes"].clip(lower=1)).astype(float)
     runs["heldout_mse_m2"] = groups["heldout_mse_m2"].first().astype(float)
+    runs["heldout_mse_m2_by_data"] = groups["heldout_mse_m2_by_data"].first()
     runs["error"] = groups["error"].first()
     return runs.reset_index()
 
