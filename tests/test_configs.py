@@ -22,6 +22,7 @@ from lerobot_constructskill.scripts.study import StudyConfig
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
+SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
 DOSE = sorted((CONFIGS / "dose").glob("*.yaml"))
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
@@ -37,6 +38,12 @@ def test_generation_configs_are_the_papers(path):
     assert config.task == ("brick_to_bin_shifted" if "shifted" in path.stem else "brick_to_bin")
     assert config.episodes == {"smoke": 2, "fast_shifted_320": 320}.get(path.stem, 80)
     assert config.noise.root[0, 0] == (0.0 if path.stem.endswith("noise_free") else 0.01)
+
+
+@pytest.mark.parametrize("path", SUITE, ids=lambda path: path.stem)
+def test_a_suites_set_is_the_everyday_set_of_its_task(path):
+    everyday = generate_config(CONFIGS / "generate" / "fast.yaml")
+    assert generate_config(path) == replace(everyday, task=path.stem)
 
 
 @pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
