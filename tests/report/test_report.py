@@ -138,17 +138,26 @@ def test_studies_at_the_ends(met, tmp_path):
     assert not list((tmp_path / "figures").glob("*_error.*"))
 
 
-def test_a_variant_that_could_not_run_is_never_a_zero(tmp_path):
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [
+        ("Out of memory.", "no run finished: Out of memory."),
+        ("FileNotFoundError: No weights for clip_vitb16: log in to the Hub.", "weights not available"),
+    ],
+)
+def test_a_variant_that_could_not_run_is_never_a_zero(error, shown, tmp_path):
     rows = episode_rows(SMALL, "fixed", "one", 0, 2, 2) + episode_rows(SMALL, "fixed", "one", 1, 2, 0)
-    rows += [failed_row(SMALL, "fixed", "two", seed, "The weights are not available.") for seed in range(2)]
+    rows += [failed_row(SMALL, "fixed", "two", seed, error) for seed in range(2)]
     findings = findings_of(SMALL, rows, tmp_path)
     one, two = findings.settings[0].lines
     assert one.outcomes["placed"].counts.met == 1
-    assert not two.outcomes and "not available" in two.absence
+    assert not two.outcomes and two.absence == shown
     assert findings.settings[0].comparisons["placed"] == []
     assert status(findings) == "No run of two (fixed) finished."
     report(ReportConfig(tmp_path))
-    assert "| two | no run finished: The weights are not available. |" in (tmp_path / "report.md").read_text()
+    markdown = (tmp_path / "report.md").read_text()
+    assert f"| two | {shown.replace('_', chr(92) + '_')} |" in markdown
+    assert error.replace("_", "\\_") in markdown.split("## Failed runs")[1]
 
 
 def test_a_study_without_any_run_gets_a_report(tmp_path):

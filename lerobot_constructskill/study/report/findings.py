@@ -10,6 +10,9 @@ from lerobot_constructskill.study.stats.comparisons import Comparison
 from lerobot_constructskill.study.stats.intervals import Estimate
 from lerobot_constructskill.study.stats.outcomes import Counts
 
+NO_WEIGHTS = "No weights for "
+"""How `frozen_vit` begins when it can get a backbone from nowhere; what it tried stands among the failed runs."""
+
 
 class Outcome(NamedTuple):
     """One variant on one criterion.
@@ -58,7 +61,11 @@ class Line:
     def absence(self) -> str:
         """Why there are no outcomes."""
         reasons = self.runs["error"].dropna()
-        return f"no run finished: {reasons.iloc[0]}" if len(reasons) else "not run yet"
+        if reasons.empty:
+            return "not run yet"
+        if reasons.str.contains(NO_WEIGHTS).all():
+            return "weights not available"
+        return f"no run finished: {reasons.iloc[0]}"
 
 
 class Table(NamedTuple):
