@@ -1,0 +1,32 @@
+"""The published results are what their rows say, and their rows are of the plans in configs/study."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import draccus
+import pytest
+
+from lerobot_constructskill.scripts.report import ReportConfig, report
+from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.report.page import read_study
+
+ROOT = Path(__file__).parents[2]
+RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/plan.yaml"))
+LARGEST = 5_000_000
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_published_study_is_one_of_configs(folder):
+    plan, _ = read_study(folder)
+    config = draccus.parse(StudyConfig, ROOT / "configs" / "study" / f"{plan.name}.yaml", args=[])
+    cuts = [None, *sorted({variant.seeds for variant in plan.variants.values()})]
+    assert plan.sha256 in [replace(config, seeds=seeds).plan.sha256 for seeds in cuts]
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_published_report_is_made_of_its_rows(folder, tmp_path):
+    copy = shutil.copytree(folder, tmp_path / folder.name)
+    report(ReportConfig(copy))
+    assert (copy / "report.md").read_text() == (folder / "report.md").read_text()
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < LARGEST
