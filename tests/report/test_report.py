@@ -139,13 +139,17 @@ def test_studies_at_the_ends(met, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "shown"),
+    ("error", "shown", "said"),
     [
-        ("Out of memory.", "no run finished: Out of memory."),
-        ("FileNotFoundError: No weights for clip_vitb16: log in to the Hub.", "weights not available"),
+        ("Out of memory.", "no run finished: Out of memory.", "No run of two (fixed) finished."),
+        (
+            "FileNotFoundError: No weights for clip_vitb16: log in to the Hub.",
+            "weights not available",
+            "Weights not available: two.",
+        ),
     ],
 )
-def test_a_variant_that_could_not_run_is_never_a_zero(error, shown, tmp_path):
+def test_a_variant_that_could_not_run_is_never_a_zero(error, shown, said, tmp_path):
     rows = episode_rows(SMALL, "fixed", "one", 0, 2, 2) + episode_rows(SMALL, "fixed", "one", 1, 2, 0)
     rows += [failed_row(SMALL, "fixed", "two", seed, error) for seed in range(2)]
     findings = findings_of(SMALL, rows, tmp_path)
@@ -153,7 +157,7 @@ def test_a_variant_that_could_not_run_is_never_a_zero(error, shown, tmp_path):
     assert one.outcomes["placed"].counts.met == 1
     assert not two.outcomes and two.absence == shown
     assert findings.settings[0].comparisons["placed"] == []
-    assert status(findings) == "No run of two (fixed) finished."
+    assert status(findings) == said
     report(ReportConfig(tmp_path))
     markdown = (tmp_path / "report.md").read_text()
     assert f"| two | {shown.replace('_', chr(92) + '_')} |" in markdown

@@ -33,11 +33,17 @@ def status(findings: Findings) -> str | None:
     if failed:
         count = "counts as a seed" if failed == 1 else "count as seeds"
         sentences.append(f"{plural(failed, 'run')} failed and {count} that met no criterion.")
-    sentences += [
-        f"No run of {line.label} ({setting.label}) finished."
+    absent = [
+        (setting, line)
         for setting in findings.settings
         for line in (*setting.lines, *setting.references)
         if line.failed and not line.outcomes
+    ]
+    unavailable = dict.fromkeys(line.label for _, line in absent if line.lacks_weights)
+    if unavailable:
+        sentences.append(f"Weights not available: {listed(list(unavailable))}.")
+    sentences += [
+        f"No run of {line.label} ({setting.label}) finished." for setting, line in absent if not line.lacks_weights
     ]
     return " ".join(sentences) or None
 

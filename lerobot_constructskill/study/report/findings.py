@@ -63,9 +63,13 @@ class Line:
         reasons = self.runs["error"].dropna()
         if reasons.empty:
             return "not run yet"
-        if reasons.str.contains(NO_WEIGHTS).all():
-            return "weights not available"
-        return f"no run finished: {reasons.iloc[0]}"
+        return "weights not available" if self.lacks_weights else f"no run finished: {reasons.iloc[0]}"
+
+    @property
+    def lacks_weights(self) -> bool:
+        """Whether every run failed for want of a backbone's weights."""
+        reasons = self.runs["error"].dropna()
+        return len(reasons) > 0 and bool(reasons.str.contains(NO_WEIGHTS).all())
 
 
 class Table(NamedTuple):
