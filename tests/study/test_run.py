@@ -1,5 +1,6 @@
 """A study as a user runs it: killed at several stages it ends as the undisturbed one, and failures are rows."""
 
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 import yaml
 
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.checkpoints import HELDOUT_FILE
 from lerobot_constructskill.study.plan import Setting, StudyPlan, Variant
 from lerobot_constructskill.study.prepare import Store
 from lerobot_constructskill.study.rows import SCHEMA, Row, merge_rows, read_rows, write_rows
@@ -19,7 +21,7 @@ from lerobot_constructskill.study.run import Options, run_study
 
 REPOSITORY = Path(__file__).parents[2]
 
-STAGES = ("data/*.partial/shards/*/*/episode", "study/runs/fixed/tiny/*/training.json", "study/results/*/tiny/*")
+STAGES = ("data/*.partial/shards/*/*/episode", f"study/runs/fixed/tiny/*/{HELDOUT_FILE}", "study/results/*/tiny/*")
 """Files whose appearance gets a study killed: a demonstration, a checkpoint, a run's rows."""
 
 ACT = {"type": "act", "pretrained_backbone_weights": None, "dim_model": 32, "n_heads": 2, "dim_feedforward": 32}
@@ -95,6 +97,8 @@ def test_the_rows_say_what_happened(undisturbed):
     assert finished["backend"].str.startswith("physx_cpu").all() and finished["final_error_m"].between(0.1, 1).all()
     tiny = finished[finished["variant"] == "tiny"]
     assert tiny["heldout_mse_m2"].between(0, 0.01).all() and tiny["weights_sha256"].nunique() == 2
+    for row in tiny.itertuples():
+        assert list(json.loads(row.heldout_mse_m2_by_data).values()) == [row.heldout_mse_m2]
     failed = undisturbed[undisturbed["error"].notna()]
     assert list(failed["variant"]) == ["absent"] * 2 and failed["lifted"].isna().all()
     assert failed["error"].str.contains("/no/such/weights").all()
