@@ -1,6 +1,6 @@
 """Your own LeRobot checkpoints beside the rows of a study: one checkpoint per training seed.
 
-Usage: python examples/compare_your_policy.py results/ten_seeds dinov2_vits14 <checkpoint> [<checkpoint> ...]
+Usage: python examples/compare_your_policy.py results/readouts reference <checkpoint> [<checkpoint> ...]
 """
 
 import sys
