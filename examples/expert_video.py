@@ -11,8 +11,9 @@ from lerobot.utils.io_utils import write_video
 from PIL import Image
 
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
-from lerobot_constructskill.demos.demonstrate import watch
+from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 SIDE = 224
@@ -22,9 +23,12 @@ def main(task: str = "brick_to_bin", folder: str = "outputs") -> None:
     expert = make_expert(get_task(task), ExpertConfig())
     env = ConstructSkillEnv(task)
     film, sheet = [], {}
-    for phase, obs in watch(env, expert, DEMO_SEED_START):
+
+    def keep(phase, obs):
         film.append(env.render())
         sheet.setdefault(phase or "end", (obs["pixels"]["base"], film[-1]))
+
+    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
     env.close()
     path = Path(folder) / f"{task}.mp4"
     path.parent.mkdir(parents=True, exist_ok=True)

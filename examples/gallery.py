@@ -11,8 +11,9 @@ from PIL import Image
 from tqdm import tqdm
 
 from lerobot_constructskill.contract import DEMO_SEED_START, TASKS, Task
-from lerobot_constructskill.demos.demonstrate import watch
+from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 SIDE = 224
@@ -27,9 +28,13 @@ def main(folder: str = "examples/pictures") -> None:
 def film(task: Task) -> list[np.ndarray]:
     """What the policy sees at the start, and the expert's demonstration at half time and at its end."""
     env, expert = ConstructSkillEnv(task.name), make_expert(task, ExpertConfig())
-    seen, close_ups = zip(
-        *((obs["pixels"]["base"], env.render()) for _, obs in watch(env, expert, DEMO_SEED_START)), strict=True
-    )
+    seen, close_ups = [], []
+
+    def keep(_, obs):
+        seen.append(obs["pixels"]["base"])
+        close_ups.append(env.render())
+
+    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
     env.close()
     return [seen[0], close_ups[len(close_ups) // 2], close_ups[-1]]
 

@@ -1,6 +1,6 @@
 """One demonstration: an expert drives an environment through noise, and every frame is kept."""
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,19 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 
 def demonstrate(
-    env: ConstructSkillEnv, expert: Expert, noise: NoiseConfig, seed: int, labels: str = "clean"
+    env: ConstructSkillEnv,
+    expert: Expert,
+    noise: NoiseConfig,
+    seed: int,
+    labels: str = "clean",
+    watch: Callable[[Phase | None, dict[str, Any]], None] | None = None,
 ) -> tuple[list[dict[str, Any]], bool]:
     """Run one attempt from the initial state of `seed`, whose noise is a function of `seed` too.
 
     Args:
         labels: whether `action` is the expert's `clean` command or what was `executed`.
+        watch: called before every step with the phase it belongs to and the observation, and at the end with None and
+            the last observation.
 
     Returns:
         The frames, in the columns of `columns.demonstration_features`, and whether the object was placed. A frame
@@ -30,6 +37,8 @@ def demonstrate(
     frames, success, truncated = [], False, False
     while progress is not None and not (success or truncated):
         clean, phase, progress = expert.act(PrivilegedState(**sim), progress)
+        if watch:
+            watch(phase, obs)
         executed = execute(clean, phase, noise, rng)
         before = {
             **{CAMERAS[name].key: image for name, image in obs["pixels"].items()},
@@ -51,21 +60,6 @@ def demonstrate(
                 "next.done": np.array([success or truncated or progress is None]),
             }
         )
+    if watch:
+        watch(None, obs)
     return frames, success
-
-
-def watch(env: ConstructSkillEnv, expert: Expert, seed: int) -> Iterator[tuple[Phase | None, dict[str, Any]]]:
-    """Run one attempt without noise and stop at every step, for whoever wants to look at it.
-
-    Yields:
-        The phase that comes next, and the observation; at the end None in place of a phase.
-    """
-    obs, _ = env.reset(seed=seed)
-    state = PrivilegedState(**env.privileged_state())
-    progress, is_over = expert.start(state), False
-    while progress is not None and not is_over:
-        action, phase, progress = expert.act(state, progress)
-        yield phase, obs
-        obs, _, success, truncated, _ = env.step(action)
-        state, is_over = PrivilegedState(**env.privileged_state()), success or truncated
-    yield None, obs

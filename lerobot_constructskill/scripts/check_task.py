@@ -88,16 +88,19 @@ def save_contact_sheet(config: CheckConfig) -> Path:
     import numpy as np
     from PIL import Image
 
-    from lerobot_constructskill.demos.demonstrate import watch
+    from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
     env = ConstructSkillEnv(config.task)
     expert = make_expert(get_task(config.task), config.expert)
     columns = {}
-    for phase, obs in watch(env, expert, DEMO_SEED_START):
+
+    def keep(phase, obs):
         if phase not in columns:
             columns[phase] = (obs["pixels"]["base"], env.render())
+
+    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"

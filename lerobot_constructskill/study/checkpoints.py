@@ -52,11 +52,6 @@ class Job:
         own = None if run.is_reference else self.plan.variants[run.variant].data
         return own or self.plan.settings[run.setting].data
 
-    @property
-    def all_data(self) -> list[str]:
-        """Every configuration of demonstrations in its setting, the setting's own first."""
-        return self.plan.data_of(self.runs[0].setting)
-
     def folder(self, run: Run) -> Path:
         return self.root / "runs" / run.id
 
@@ -64,9 +59,10 @@ class Job:
         return self.folder(run) / "pretrained_model"
 
 
-def demonstrations(job: Job) -> LeRobotDataset:
+def demonstrations(job: Job, data: str | None = None) -> LeRobotDataset:
+    """The data set of a configuration, of the job's own by default."""
     with timed(job.root, "demonstrations"):
-        return job.store.demonstrations(job.data)
+        return job.store.demonstrations(data or job.data)
 
 
 def heldout_errors(job: Job, run: Run) -> dict[str, float | None]:
@@ -112,8 +108,7 @@ def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training:
 
 
 def _features(job: Job, data: str, policy: dict[str, Any], is_blind: bool) -> LeRobotDataset:
-    with timed(job.root, "demonstrations"):
-        made = job.store.demonstrations(data)
+    made = demonstrations(job, data)
     with timed(job.root, "encoding"):
         return job.store.features(made, policy, is_blind)
 
@@ -122,7 +117,7 @@ def _validation_sets(
     job: Job, features: LeRobotDataset, policy: dict[str, Any], is_blind: bool
 ) -> Iterator[tuple[str, LeRobotDataset]]:
     """Yield what its setting validates on, but for sets that cannot be made or lack a column of its own set."""
-    for data in job.all_data:
+    for data in job.plan.data_of(job.runs[0].setting):
         try:
             other = features if data == job.data else _features(job, data, policy, is_blind)
         except (OSError, ValueError):

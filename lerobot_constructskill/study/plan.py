@@ -146,8 +146,7 @@ class StudyPlan:
         return [
             Run(setting, name, seed)
             for setting in self.settings
-            for name, variant in self.variants.items()
-            if setting in (variant.settings or self.settings)
+            for name, variant in self.variants_in(setting).items()
             for seed in range(variant.seeds)
         ]
 
@@ -167,8 +166,12 @@ class StudyPlan:
         Every policy of the setting is validated on the same demonstrations, those that are held out of each. (The
         paper validates its policy without noise on demonstrations without noise, section IV.)
         """
-        variants = [v for v in self.variants.values() if setting in (v.settings or self.settings)]
-        return list(dict.fromkeys([self.settings[setting].data, *(v.data for v in variants if v.data)]))
+        data = (variant.data for variant in self.variants_in(setting).values() if variant.data)
+        return list(dict.fromkeys([self.settings[setting].data, *data]))
+
+    def variants_in(self, setting: str) -> dict[str, Variant]:
+        """The variants that run in a setting, by name."""
+        return {name: v for name, v in self.variants.items() if setting in (v.settings or self.settings)}
 
     def variant_of(self, run: Run) -> Variant:
         """What a run trains; `blind` and `untrained` are the first frozen_vit variant, with other eyes.

@@ -83,10 +83,7 @@ def _repeated(runs: pd.DataFrame) -> tuple[int, int]:
 def _setting(plan: StudyPlan, name: str, runs: pd.DataFrame) -> SettingFindings:
     rng = np.random.default_rng(0)
     variants = runs[~runs["is_reference"]]
-    lines = [
-        _line(variant, plan.variants[variant].label, plan.variants[variant].seeds, variants, rng)
-        for variant in _variants_of(plan, name)
-    ]
+    lines = [_line(variant, spec.label, spec.seeds, variants, rng) for variant, spec in plan.variants_in(name).items()]
     found = runs[runs["is_reference"]]
     references = [
         _line(reference, REFERENCE_LABELS[reference], None, found, rng)
@@ -110,10 +107,6 @@ def _setting(plan: StudyPlan, name: str, runs: pd.DataFrame) -> SettingFindings:
         rate_tests={criterion: _rate_tests(made, pairs, criterion, rng) for criterion in CRITERIA},
         correlations={criterion: _correlations(lines, criterion, rng) for criterion in CRITERIA},
     )
-
-
-def _variants_of(plan: StudyPlan, setting: str) -> list[str]:
-    return [name for name, variant in plan.variants.items() if setting in (variant.settings or plan.settings)]
 
 
 def _line(name: str, label: str | None, seeds: int | None, runs: pd.DataFrame, rng: np.random.Generator) -> Line:
