@@ -32,9 +32,13 @@ PATCHES = ".patches.npy"
 
 
 def load_encoder(
-    backbone: str, path: str | None = None, precision: str = "float32", crop: Crop | None = None
+    backbone: str,
+    path: str | None = None,
+    precision: str = "float32",
+    crop: Crop | None = None,
+    device: torch.device | str = "cpu",
 ) -> tuple[FrozenEncoder, dict[str, str]]:
-    """Return an encoder with its weights, and the description that its features carry.
+    """Return an encoder with its weights on a device, and the description that its features carry.
 
     Raises:
         ValueError: unknown backbone or precision, or damaged weights.
@@ -46,6 +50,7 @@ def load_encoder(
     state, source = load_weights(spec, path)
     encoder = FrozenEncoder(spec, precision, crop)
     encoder.model.load_state_dict(state)
+    encoder.to(device)
     made = {"weights_source": source, "runtime": encoder.runtime}
     return encoder, {**describe(spec, state_sha256(state), precision, crop), **made}
 

@@ -49,8 +49,10 @@ def encode(config: EncodeConfig) -> Path:
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:
-        encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision, config.crop)
-        encoder.to(config.device or auto_select_torch_device())
+        device = config.device or auto_select_torch_device()
+        encoder, info = load_encoder(
+            config.backbone, config.backbone_path, config.backbone_precision, config.crop, device
+        )
         dataset = LeRobotDataset(config.repo_id, root=config.root)
         write_feature_set(
             dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches

@@ -46,7 +46,7 @@ def study(config: StudyConfig) -> str:
     Raises:
         FileExistsError: another process is running it.
         FileNotFoundError: a data set's configuration does not exist.
-        ValueError: the folder holds another plan's results.
+        ValueError: the folder holds another plan's results, or not one run succeeded.
     """
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.study.prepare import Store
@@ -56,6 +56,8 @@ def study(config: StudyConfig) -> str:
     options = Options(config.together, config.executor, config.workers, config.retry_failed)
     rows = run_study(config.plan, root.absolute(), Store(config.data_root.absolute(), config.workers), options)
     runs = rows.groupby(["setting", "variant", "training_seed"])["error"].first()
+    if runs.notna().all():
+        raise ValueError(f"All {len(runs)} runs failed, as their rows in {root} say; the first: {runs.iloc[0]}")
     return f"{len(runs)} runs, {runs.notna().sum()} of them failed: {root} (next: constructskill-report --root={root})"
 
 

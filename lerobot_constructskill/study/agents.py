@@ -1,7 +1,7 @@
 """What a rollout can drive an environment with: any LeRobot policy, many of which can share one encoder."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -145,12 +145,24 @@ def share_encoders(agents: Sequence[Agent]) -> dict[SharedEncoder, list[int]]:
 
 def encode_together(
     agents: Sequence[Agent], encoders: Mapping[SharedEncoder, list[int]], observations: Mapping[int, Observation]
-) -> dict[int, Observation]:
-    """Give every observation, by its agent's number, what its readout takes: one batch for each encoder."""
-    encoded = dict(observations)
+) -> dict[int, Observation | Exception]:
+    """Give every observation, by its agent's number, what its readout takes: one batch for each encoder.
+
+    In place of an observation without the image that its agent asks for stands the exception.
+    """
+    encoded: dict[int, Observation | Exception] = dict(observations)
     for encoder, sharing in encoders.items():
-        numbers = [i for i in sharing if i in observations]
-        pooled = encoder([agents[i].image(observations[i]) for i in numbers])
-        for i, one in zip(numbers, pooled, strict=True):
-            encoded[i] = replace(observations[i], pooled=one)
+        images = {i: attempt(agents[i].image, observations[i]) for i in sharing if i in observations}
+        encoded |= images
+        images = {i: image for i, image in images.items() if not isinstance(image, Exception)}
+        for i, pooled in zip(images, encoder(list(images.values())), strict=True):
+            encoded[i] = replace(observations[i], pooled=pooled)
     return encoded
+
+
+def attempt(call: Callable[..., Any], *args: Any) -> Any:
+    """What a call returns, or the exception that it raises."""
+    try:
+        return call(*args)
+    except Exception as error:
+        return error

@@ -1,6 +1,7 @@
 """The checkpoints of a study: what is trained for a job, once, as ordinary LeRobot policies."""
 
 import json
+import logging
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, tra
 
 TRAINED = ("blind", "untrained")
 """References that train a policy."""
+
+logger = logging.getLogger(__name__)
 
 HELDOUT_FILE = "heldout_mse_m2.json"
 
@@ -71,18 +74,27 @@ def heldout_errors(job: Job, run: Run) -> dict[str, float | None]:
     return json.loads(file.read_text()) if file.exists() else {}
 
 
-def train(job: Job) -> None:
-    """Train the runs of a job that have no checkpoint yet; each appears whole or not at all."""
+def train(job: Job) -> dict[Run, Exception]:
+    """Train the runs of a job that have no checkpoint yet, each of which appears whole or not at all.
+
+    Returns:
+        The runs that could not be trained, and why.
+    """
     missing = [run for run in job.runs if not job.folder(run).exists()]
     if not missing:
-        return
+        return {}
     variant = job.plan.variant_of(missing[0])
     training = replace(job.plan.training, **variant.training)
     if variant.policy["type"] == "frozen_vit":
         _train_together(job, missing, dict(variant.policy), training)
-    else:
-        for run in missing:
-            _train_stock(job, run, variant.policy, training)
+        return {}
+    dataset, failed = demonstrations(job), {}
+    for run in missing:
+        try:
+            _train_stock(job, run, dataset, variant.policy, training)
+        except Exception as error:  # the other seeds have nothing to do with it
+            failed[run] = error
+    return failed
 
 
 def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training: Training) -> None:
@@ -120,15 +132,15 @@ def _validation_sets(
     for data in job.plan.data_of(job.runs[0].setting):
         try:
             other = features if data == job.data else _features(job, data, policy, is_blind)
-        except (OSError, ValueError):
-            continue  # the variant that trains on it says so in its rows
+        except (OSError, ValueError) as error:
+            logger.warning("%s is not validated on %s: %s", job.runs[0].variant, data, error)
+            continue
         if other.meta.features.keys() >= features.meta.features.keys():
             yield data, other
 
 
-def _train_stock(job: Job, run: Run, policy: dict[str, Any], training: Training) -> None:
+def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, Any], training: Training) -> None:
     """Train any other policy type with lerobot-train, for as many passes over the same demonstrations."""
-    dataset = demonstrations(job)
     kept = [i for i in range(dataset.num_episodes) if i % training.holdout != training.holdout - 1]
     frames = sum(dataset.meta.episodes["length"][i] for i in kept)
     steps = training.epochs * -(-frames // training.batch_size)
@@ -147,10 +159,13 @@ def _train_stock(job: Job, run: Run, policy: dict[str, Any], training: Training)
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]
-        with timed(job.root, "training"):
-            done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise RuntimeError(f"lerobot-train failed: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+        log = job.root / "logs" / f"{run.id}.log"
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with timed(job.root, "training"), log.open("w") as output:
+            status = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT).returncode
+        if status:
+            said = log.read_text().strip().splitlines() or ["nothing"]
+            raise RuntimeError(f"lerobot-train ended with status {status}; {log} ends with: {said[-1]}")
         last = (folder / "checkpoints" / "last" / "pretrained_model").resolve()
         last.rename(folder / job.checkpoint(run).name)
 

@@ -4,7 +4,8 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.hashing import file_sha256
@@ -20,7 +21,16 @@ from lerobot_constructskill.study.timing import timed
 WITHOUT_DATA = ("no_op", "random", "expert")
 """References that use no demonstrations, whether or not another job has made them."""
 
-PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "transformers", "numpy")
+PACKAGES = (
+    "lerobot_env_constructskill",
+    "lerobot",
+    "mani_skill",
+    "sapien",
+    "torch",
+    "openvino",
+    "transformers",
+    "numpy",
+)
 
 
 def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
@@ -29,31 +39,38 @@ def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
     A run that fails yields one row that says why.
     """
     try:
-        agents = _agents(job)
+        failed = train(job) if _is_trained(job) else {}
+        runs = [run for run in job.runs if run not in failed]
+        agents = _agents(job, runs)
     except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
-        yield from ((run, [_failed(job, run, error)]) for run in job.runs)
+        failed, runs, agents = dict.fromkeys(job.runs, error), [], []
+    yield from ((run, [_failed(job, run, error)]) for run, error in failed.items())
+    if not runs:
         return
     seeds = range(job.plan.eval_seed, job.plan.eval_seed + job.plan.episodes)
     film = Film()
     with timed(job.root, "evaluation"):
         for i, outcome in roll_out(agents, job.env, seeds, on_step=film.add):
-            run, failed = job.runs[i], outcome.error
+            run, error = runs[i], outcome.error
             video = film.write(job.root, run)
-            yield run, _finished(job, run, outcome, video) if failed is None else [_failed(job, run, failed)]
+            yield run, _finished(job, run, outcome, video) if error is None else [_failed(job, run, error)]
 
 
-def _agents(job: Job) -> list[Agent]:
+def _is_trained(job: Job) -> bool:
+    return not job.runs[0].is_reference or job.runs[0].variant in TRAINED
+
+
+def _agents(job: Job, runs: list[Run]) -> list[Agent]:
     name = job.runs[0].variant
-    if not job.runs[0].is_reference or name in TRAINED:
-        train(job)
+    if _is_trained(job):
         kind = Blind if name == "blind" else PolicyAgent
-        return [kind.from_pretrained(job.checkpoint(run)) for run in job.runs]
+        return [kind.from_pretrained(job.checkpoint(run)) for run in runs]
     task = get_task(job.env.get("task", "brick_to_bin"))
     if name == "replay":
-        return [Replay(task, demonstrations(job), run.seed) for run in job.runs]
+        return [Replay(task, demonstrations(job), run.seed) for run in runs]
     if name == "random":
-        return [Random(task, run.seed) for run in job.runs]
-    return [{"no_op": NoOp, "expert": Expert}[name](task) for _ in job.runs]
+        return [Random(task, run.seed) for run in runs]
+    return [{"no_op": NoOp, "expert": Expert}[name](task) for _ in runs]
 
 
 def _finished(job: Job, run: Run, outcome: Outcome, video: str | None) -> list[Row]:
@@ -87,5 +104,23 @@ def _row(job: Job, run: Run, backend: str | None = None) -> Row:
         weights_sha256=file_sha256(model) if model.exists() else None,
         environment_sha256=hashlib.sha256(environment.encode()).hexdigest(),
         backend=backend,
-        versions=json.dumps({name: version(name) for name in PACKAGES}),
+        versions=json.dumps(_versions() | _backbone(job.checkpoint(run) / "config.json")),
     )
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # openvino is of an extra
+            continue
+    return found
+
+
+def _backbone(config_file: Path) -> dict[str, str]:
+    """Where a frozen_vit checkpoint's backbone came from, whose weights are none of the checkpoint's."""
+    config = json.loads(config_file.read_text()) if config_file.exists() else {}
+    if not config.get("backbone_sha256"):
+        return {}
+    return {config["backbone"]: f"{config['backbone_source']}, SHA-256 {config['backbone_sha256'][:12]}"}

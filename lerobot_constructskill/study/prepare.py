@@ -13,6 +13,7 @@ from typing import Any
 import draccus
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.device_utils import auto_select_torch_device
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -83,6 +84,7 @@ class Store:
             policy.get("backbone_path"),
             policy.get("backbone_precision", "float32"),
             policy.get("crop"),
+            policy.get("device") or auto_select_torch_device(),
         )
         patches = READOUTS[policy.get("readout", "cls")].reads_patches
         made_of = {**info, "camera": camera, "blind": blind} | ({"patches": True} if patches else {})
@@ -119,7 +121,7 @@ class Blindfolded:
 
     def __init__(self, encoder: FrozenEncoder):
         self.spec, self.device = encoder.spec, encoder.device
-        self.tokens = encoder.encode(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY))
+        self.tokens = encoder.encode(torch.full((1, 3, IMAGE_SIZE, IMAGE_SIZE), GREY, device=encoder.device))
 
     def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the grey image's tokens once for each of `images`, as `FrozenEncoder.encode` does."""

@@ -8,7 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.study.agents import Agent, Observation, encode_together, share_encoders
+from lerobot_constructskill.study.agents import Agent, Observation, attempt, encode_together, share_encoders
 from lerobot_constructskill.study.rows import STAGES
 from lerobot_constructskill.study.simulators import Simulators, Step, simulators
 
@@ -97,8 +97,8 @@ class _Lanes:
     def advance(self) -> None:
         """One step of every agent that still runs."""
         seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in self.current.items()}
-        seen = encode_together(self.agents, self.encoders, seen)
-        actions = self._settle({i: _attempt(self.agents[i].act, observation) for i, observation in seen.items()})
+        seen = self._settle(encode_together(self.agents, self.encoders, seen))
+        actions = self._settle({i: attempt(self.agents[i].act, observation) for i, observation in seen.items()})
         self.current = self._settle(self.sims.step(actions))
         for i, step in self.current.items():
             self.outcomes[i].episodes[-1].add(step)
@@ -122,8 +122,8 @@ class _Lanes:
         seeds = {i: self.seeds[len(self.outcomes[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
             self.outcomes[i].episodes.append(Episode(seed))
-            self.agents[i].reset(seed)
-        self.current |= self._settle(self.sims.reset(seeds))
+        ready = self._settle({i: attempt(self.agents[i].reset, seed) for i, seed in seeds.items()})
+        self.current |= self._settle(self.sims.reset({i: seeds[i] for i in ready}))
 
     def _settle(self, results: dict[int, Any]) -> dict[int, Any]:
         """Take out the agents whose result is an exception: they have failed."""
@@ -131,10 +131,3 @@ class _Lanes:
             if isinstance(result, Exception):
                 self.outcomes[i] = Outcome(error=result)
         return {i: result for i, result in results.items() if not isinstance(result, Exception)}
-
-
-def _attempt(act: Callable[[Observation], np.ndarray], observation: Observation) -> np.ndarray | Exception:
-    try:
-        return act(observation)
-    except Exception as error:
-        return error

@@ -56,17 +56,18 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
     """
     with _claimed(root):
         _write_plan(plan, root)
-        start = time.monotonic()
+        earlier, start = _wall_time(root), time.monotonic()
         runs = [*plan.reference_runs, *plan.runs]
         finished = [run for run in runs if _is_finished(root, run, options)]
         with tqdm(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
             for run, rows in _execute(_jobs(plan, root, store, runs, finished, options.together), options):
                 write_rows(rows, _row_file(root, run))
                 _merge(root, runs)
+                _write_provenance(root, earlier + time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
         _merge(root, runs)
-        _write_provenance(root, time.monotonic() - start)
+        _write_provenance(root, earlier + time.monotonic() - start)
         return read_rows(root / ROWS)
 
 
@@ -138,11 +139,15 @@ def _processor() -> str:
     return names[0] if names else platform.machine()
 
 
-def _write_provenance(root: Path, seconds: float) -> None:
-    """Say where the study ran, and for how long in all; a study that was interrupted adds up."""
+def _wall_time(root: Path) -> float:
+    """Seconds that earlier sessions of the study took, up to the last run that each finished."""
     path = root / PROVENANCE
-    before = json.loads(path.read_text())["wall time, s"] if path.exists() else 0
+    return json.loads(path.read_text())["wall time, s"] if path.exists() else 0
+
+
+def _write_provenance(root: Path, seconds: float) -> None:
+    """Say where the study ran, and for how long in all."""
     stages = {f"of which {stage}, s": round(total) for stage, total in seconds_by_stage(root).items()}
-    facts = {"wall time, s": round(before + seconds), **stages, "machine": f"{os.cpu_count()} cores, {_processor()}"}
-    with replaced(path) as partial:
+    facts = {"wall time, s": round(seconds), **stages, "machine": f"{os.cpu_count()} cores, {_processor()}"}
+    with replaced(root / PROVENANCE) as partial:
         partial.write_text(json.dumps(facts, indent=2) + "\n")

@@ -170,7 +170,7 @@ def _step_together(
     scheduler = schedule.build(optimizer, n_steps) if schedule else None
     for batch in tqdm(_batches(orders, training), f"training {len(heads)} seeds", n_steps, unit="step"):
         target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
-        seen = [column[batch].float() for column in inputs]
+        seen = [column[batch].to(config.device).float() for column in inputs]
         raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
         losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss(weight))(raw, target, padded)
         optimizer.zero_grad()

@@ -1,5 +1,7 @@
 """Rollouts in lockstep are `lerobot-eval`'s, step for step, and a policy that fails takes none down with it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -84,6 +86,31 @@ class Broken:
         if self.action is None and self.n == 3:
             raise ValueError("lost the plot")
         return np.zeros(4, dtype=np.float32) if self.action is None else self.action
+
+
+class Sightless(Broken):
+    """Asks for an image that is not there, or cannot begin an episode."""
+
+    encoder = encoder_key = "one that is never used"
+
+    def __init__(self, action, **policy):
+        super().__init__(action)
+        self.policy = SimpleNamespace(**policy)
+
+    def reset(self, seed):
+        if self.action is None:
+            raise RuntimeError("no beginning")
+
+    def image(self, observation):
+        return observation.seen["pixels"]["wrist"]
+
+
+def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on():
+    hover = np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32)
+    agents = [Sightless(None), Broken(hover), Sightless(hover)]
+    unready, fine, blind = (outcome for _, outcome in sorted(roll_out(agents, ENV, SEEDS, n_workers=2)))
+    assert "no beginning" in str(unready.error) and isinstance(blind.error, KeyError)
+    assert fine.error is None and len(fine.episodes) == len(SEEDS)
 
 
 def test_a_failing_agent_is_recorded_and_the_others_go_on():

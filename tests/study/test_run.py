@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study import checkpoints
 from lerobot_constructskill.study.checkpoints import HELDOUT_FILE
 from lerobot_constructskill.study.plan import Setting, StudyPlan, Variant
 from lerobot_constructskill.study.prepare import Store
@@ -139,18 +140,36 @@ def test_a_changed_plan_is_not_mixed_with_old_results(tmp_path):
 
 
 def run_study_without_runs(of, root):
-    """Every run is there already, as a row."""
+    """Every run is there already, as a row; the last was written first."""
     root.mkdir(exist_ok=True)
-    for run in of.runs:
-        row = Row(plan().sha256, run.setting, run.variant, False, run.seed, 1000, 0)
+    for run in reversed(of.runs):
+        row = Row(of.sha256, run.setting, run.variant, False, run.seed, 1000, 0)
         write_rows([row], root / "results" / run.id / "rows.parquet")
     return run_study(of, root, Store(root / "data"), Options())
 
 
 def test_finished_runs_are_kept_in_the_order_of_the_plan(tmp_path):
-    (tmp_path / "study").mkdir()
-    run_study_without_runs(plan(), tmp_path / "study")  # nothing to run: neither data nor weights exist here
-    assert not (tmp_path / "study" / "data").exists()
+    variants = {name: Variant({"type": "frozen_vit"}, seeds=11) for name in ("b", "a")}
+    settings = {name: Setting("d.yaml") for name in ("second", "first")}
+    of = plan(variants=variants, settings=settings)
+    rows = run_study_without_runs(of, tmp_path / "study")  # nothing to run: neither data nor weights exist here
+    assert [*zip(rows["setting"], rows["variant"], rows["training_seed"], strict=True)] == [
+        (run.setting, run.variant, run.seed) for run in of.runs
+    ]
+
+
+def test_a_seed_that_cannot_be_trained_takes_no_other_with_it(tmp_path, monkeypatch):
+    """lerobot-train is replaced: there is no way to make it fail on one seed alone."""
+
+    def train_stock(job, run, *_):
+        if run.seed == 1:
+            raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(checkpoints, "_train_stock", train_stock)
+    monkeypatch.setattr(checkpoints, "demonstrations", lambda job: None)
+    of = plan(variants={"act": Variant({"type": "act"}, seeds=3)})
+    failed = checkpoints.train(checkpoints.Job(of, tuple(of.runs), tmp_path, Store(tmp_path / "data")))
+    assert {run.seed: str(error) for run, error in failed.items()} == {1: "out of memory"}
 
 
 @pytest.mark.parametrize(
