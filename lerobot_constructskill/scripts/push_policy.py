@@ -15,8 +15,8 @@ class PushPolicyConfig:
     policy_path: Path  # a checkpoint's `pretrained_model` folder
     evaluations: Path  # folder of seed_*/eval_info.json, as lerobot-eval writes them
     repo_id: str  # its name on the Hub, user/name
+    task: str  # what it was evaluated in, as `--env.task`
     private: bool = False  # whether only its owner sees it
-    task: str = "brick_to_bin"  # what it was evaluated in
 
     def __post_init__(self):
         get_task(self.task)

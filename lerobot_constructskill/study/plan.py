@@ -163,7 +163,7 @@ class StudyPlan:
     def data_of(self, setting: str) -> list[str]:
         """Every `constructskill-generate` configuration in a setting, its own first.
 
-        Every policy of the setting is validated on the same demonstrations, those that are held out of each. (The
+        Every `frozen_vit` policy of the setting is validated on what is held out of each of them. (The
         paper validates its policy without noise on demonstrations without noise, section IV.)
         """
         data = (variant.data for variant in self.variants_in(setting).values() if variant.data)

@@ -57,7 +57,12 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
         call(BIN / "lerobot-train", *ACT, *SMALL, *SHORT, *source, f"--output_dir={tmp_path / 'act'}")
         checkpoint = tmp_path / "act" / "checkpoints" / "000002" / "pretrained_model"
         call(BIN / "lerobot-eval", f"--policy.path={checkpoint}", *EVAL, f"--output_dir={evaluations / 'seed_7'}")
-        flags = [f"--policy_path={checkpoint}", f"--evaluations={evaluations}", "--repo_id=alice/act"]
+        flags = [
+            f"--policy_path={checkpoint}",
+            f"--evaluations={evaluations}",
+            "--repo_id=alice/act",
+            "--task=brick_to_bin",
+        ]
         call(sys.executable, "-c", PUSH_POLICY, *flags)
         call(BIN / "lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
         files = hub.repos["models/alice/act"].commits[hub.repos["models/alice/act"].branches["main"]]

@@ -188,23 +188,47 @@ def test_permutation_tests_keep_their_level(test, rng):
 
 
 def test_kendall_finds_order_and_none(rng):
-    error = np.arange(20.0)
-    assert kendall(error, -error, rng).value == pytest.approx(-1)
-    estimate = kendall(error, np.tile([0.0, 10.0], 10), rng)
-    assert -1 <= estimate.low < 0 < estimate.high <= 1
+    error, one = np.arange(20.0), np.full(20, "one")
+    ordered = kendall(error, -error, one, rng)
+    assert ordered.tau.value == pytest.approx(-1) and ordered.p_value < 0.01
+    none = kendall(error, np.tile([0.0, 10.0], 10), one, rng)
+    assert -1 <= none.tau.low < 0 < none.tau.high <= 1 and none.p_value > 0.1
+
+
+def test_a_better_variant_with_a_lower_error_is_no_order_within_variants(rng):
+    variant = np.repeat(["good", "bad"], 20)
+    error = np.repeat([1.0, 9.0], 20) + rng.random(40)
+    success = np.repeat([8.0, 1.0], 20) + rng.integers(0, 2, 40)
+    assert abs(kendalltau(error, success).statistic) > 0.5
+    within = kendall(error, success, variant, rng)
+    assert abs(within.tau.value) < 0.4 and within.p_value > 0.05
+
+
+@pytest.mark.parametrize("successes", [1, 3])
+def test_kendalls_p_value_keeps_its_level_where_few_succeed(successes, rng):
+    p_values = []
+    for _ in range(100):
+        success = rng.permutation([1.0] * successes + [0.0] * (20 - successes))
+        p_values.append(kendall(rng.random(20), success, np.repeat(["a", "b"], 10), rng).p_value)
+    assert np.mean(np.array(p_values) < 0.05) <= 0.1
 
 
 def test_resampled_tau_is_scipys(rng):
     x, y = rng.integers(0, 4, (2, 5, 12)).astype(float)
-    assert _tau_b(x, y, -1) == pytest.approx([kendalltau(a, b).statistic for a, b in zip(x, y, strict=True)])
+    assert _tau_b(x, y, [np.arange(12)]) == pytest.approx(
+        [kendalltau(a, b).statistic for a, b in zip(x, y, strict=True)]
+    )
 
 
 def test_kendall_needs_errors_and_outcomes_that_differ(rng):
     nothing = np.full(10, np.nan)
     for error, success in [(nothing, np.arange(10)), (np.arange(10), np.ones(10)), (np.arange(4), np.arange(4))]:
-        assert kendall(error, success, rng) is None
-    error = np.array([*range(9), np.nan])
-    assert kendall(error, -error, rng) == kendall(error[:9], -error[:9], np.random.default_rng(0))
+        assert kendall(error, success, np.zeros(len(error)), rng) is None
+    assert kendall(np.arange(10), np.repeat([0, 1], 5), np.repeat([0, 1], 5), rng) is None  # only between variants
+    error, one = np.array([*range(9), np.nan]), np.zeros(10)
+    assert kendall(error, -error, one, np.random.default_rng(0)) == kendall(
+        error[:9], -error[:9], one[:9], np.random.default_rng(0)
+    )
 
 
 def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion():

@@ -57,7 +57,7 @@ def _paragraph(setting: SettingFindings, n_episodes: int, alpha: float) -> str:
         _verdicts(setting, "lifted", "Lifting"),
         _verdicts(setting, "placed", "Placing"),
         _shares(setting, alpha),
-        _offline_error(setting),
+        _offline_error(setting, alpha),
         _sightless(setting, n_episodes),
     ]
     return " ".join(sentence for sentence in sentences if sentence)
@@ -127,14 +127,14 @@ def _shares(setting: SettingFindings, alpha: float) -> str:
     return f"Seeds succeed in some of their episodes here; by mean episodes placed, {found}."
 
 
-def _offline_error(setting: SettingFindings) -> str:
-    estimate = setting.correlations["placed"][0][1] if setting.correlations["placed"] else None
-    if estimate is None:
+def _offline_error(setting: SettingFindings, alpha: float) -> str:
+    correlation = setting.correlations["placed"][0][1]
+    if correlation is None:
         return ""
-    if estimate.low <= 0 <= estimate.high:
-        return f"Held-out error does not tell which runs place ({tau(estimate)})."
-    direction = "lower" if estimate.value < 0 else "higher"
-    return f"Runs with {direction} held-out error place more often ({tau(estimate)})."
+    if correlation.p_value >= alpha:
+        return f"Held-out error does not tell which seeds of a variant place ({tau(correlation)})."
+    direction = "lower" if correlation.tau.value < 0 else "higher"
+    return f"A variant's seeds with {direction} held-out error place more often ({tau(correlation)})."
 
 
 def _sightless(setting: SettingFindings, n_episodes: int) -> str:

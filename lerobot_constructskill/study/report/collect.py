@@ -9,7 +9,7 @@ import pandas as pd
 from lerobot_constructskill.study.plan import StudyPlan
 from lerobot_constructskill.study.report.findings import Findings, Line, Outcome, RateTest, SettingFindings, Table
 from lerobot_constructskill.study.stats.comparisons import compare, holm
-from lerobot_constructskill.study.stats.correlation import kendall
+from lerobot_constructskill.study.stats.correlation import Correlation, kendall
 from lerobot_constructskill.study.stats.intervals import Estimate, clopper_pearson, wilson
 from lerobot_constructskill.study.stats.outcomes import CRITERIA, count, seed_outcomes
 from lerobot_constructskill.study.stats.spread import mean_p_value, mean_rate, spread, spread_p_value
@@ -163,6 +163,8 @@ def _rate_tests(
     ]
 
 
-def _correlations(lines: list[Line], criterion: str, rng: np.random.Generator) -> list[tuple[str, Estimate | None]]:
-    runs = [("All runs", pd.concat([line.runs for line in lines]))] + [(line.label, line.runs) for line in lines]
-    return [(label, kendall(own["heldout_mse_m2"].to_numpy(), own[criterion].to_numpy(), rng)) for label, own in runs]
+def _correlations(lines: list[Line], criterion: str, rng: np.random.Generator) -> list[tuple[str, Correlation | None]]:
+    every = pd.concat([line.runs for line in lines])
+    runs = [("Within variants", every)] + [(line.label, line.runs) for line in lines]
+    columns = "heldout_mse_m2", criterion, "variant"
+    return [(label, kendall(*(own[column].to_numpy() for column in columns), rng)) for label, own in runs]

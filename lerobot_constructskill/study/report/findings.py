@@ -7,6 +7,7 @@ import pandas as pd
 
 from lerobot_constructskill.study.plan import StudyPlan
 from lerobot_constructskill.study.stats.comparisons import Comparison
+from lerobot_constructskill.study.stats.correlation import Correlation
 from lerobot_constructskill.study.stats.intervals import Estimate
 from lerobot_constructskill.study.stats.outcomes import Counts
 
@@ -111,7 +112,7 @@ class SettingFindings:
         comparisons: criterion to the declared comparisons that could be made.
         declared: how many comparisons the plan declares here.
         rate_tests: criterion to the same pairs' mean and spread over seeds.
-        correlations: criterion to (label, Kendall's tau of held-out error and episodes), all runs first.
+        correlations: criterion to (label, Kendall's tau of held-out error and episodes), over all variants first.
     """
 
     name: str
@@ -122,7 +123,7 @@ class SettingFindings:
     comparisons: dict[str, list[Comparison]]
     declared: int
     rate_tests: dict[str, list[RateTest]]
-    correlations: dict[str, list[tuple[str, Estimate | None]]]
+    correlations: dict[str, list[tuple[str, Correlation | None]]]
 
     @property
     def all_or_nothing(self) -> bool:

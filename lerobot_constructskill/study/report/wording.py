@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from lerobot_constructskill.study.stats.correlation import Correlation
 from lerobot_constructskill.study.stats.intervals import Estimate
 
 
@@ -68,10 +69,10 @@ def error_range(estimate: Estimate | None) -> str:
     return f"{value:.2f} [{low:.2f}–{high:.2f}]"
 
 
-def tau(estimate: Estimate | None) -> str:
-    if estimate is None:
-        return "–"
-    return f"Kendall's τ {signed(estimate.value, 2)}, {signed(estimate.low, 2)} to {signed(estimate.high, 2)}"
+def tau(correlation: Correlation) -> str:
+    """Kendall's tau with its p-value, in running text."""
+    p = p_value(correlation.p_value)
+    return f"Kendall's τ {signed(correlation.tau.value, 2)}, p {p if p.startswith('<') else f'= {p}'}"
 
 
 def episodes(share: float, n: int) -> str:
