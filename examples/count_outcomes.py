@@ -4,28 +4,21 @@ Reads FOLDER/eval/seed_*/eval_info.json (the reward of a step is the stage reach
 tells whether it lifted and placed) and the held-out error in FOLDER/train_*.log.
 """
 
-import json
 import re
 import sys
 from pathlib import Path
 
-from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
+from lerobot_constructskill.data.policy_card import seed_outcomes
 
 
 def main(folder: Path) -> None:
     print("| seed | lifted | placed | held-out translation error (1e-4 m2) |\n|---:|---:|---:|---:|")
-    seeds = sorted(folder.glob("eval/seed_*"), key=lambda path: int(path.name.split("_")[1]))
-    lifted_seeds = placed_seeds = 0
-    for path in seeds:
-        seed = path.name.split("_")[1]
-        stages = json.loads((path / "eval_info.json").read_text())["per_task"][0]["metrics"]["max_rewards"]
-        lifted = sum(stage >= REWARD_LIFTED for stage in stages)
-        placed = sum(stage >= REWARD_PLACED for stage in stages)
-        lifted_seeds += lifted > 0
-        placed_seeds += placed > 0
+    outcomes = seed_outcomes(folder / "eval")
+    for seed, lifted, placed, episodes in outcomes:
         error = re.findall(r"heldout_translation_mse_m2=(\S+)", (folder / f"train_{seed}.log").read_text())[-1]
-        print(f"| {seed} | {lifted}/{len(stages)} | {placed}/{len(stages)} | {float(error) * 1e4:.2f} |")
-    print(f"\nSeeds that lifted: {lifted_seeds} of {len(seeds)}; that placed: {placed_seeds} of {len(seeds)}.")
+        print(f"| {seed} | {lifted}/{episodes} | {placed}/{episodes} | {float(error) * 1e4:.2f} |")
+    lifted_seeds, placed_seeds = (sum(outcome[i] > 0 for outcome in outcomes) for i in (1, 2))
+    print(f"\nSeeds that lifted: {lifted_seeds} of {len(outcomes)}; that placed: {placed_seeds} of {len(outcomes)}.")
     videos = sorted(folder.glob("eval/seed_*/videos/**/*.mp4"))
     print("Videos:", *videos, sep="\n  ")
 

@@ -39,9 +39,12 @@ class CheckConfig:
 
 
 def check(config: CheckConfig) -> str:
+    from lerobot_constructskill.study.stats.intervals import clopper_pearson
+    from lerobot_constructskill.study.stats.outcomes import Counts
+
     sheet = save_contact_sheet(config)
     lengths, failures = measure_expert(config)
-    low, high = clopper_pearson(config.states - len(failures), config.states)
+    _, low, high = clopper_pearson(Counts(config.states - len(failures), config.states))
     report = (
         f"{config.task}: the expert succeeds in {config.states - len(failures)} of {config.states} initial states "
         f"(95 % Clopper-Pearson {low:.1%} to {high:.1%}), in at most {max(lengths, default=0)} of "
@@ -73,14 +76,6 @@ def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
             failures.append(seed)
     env.close()
     return lengths, failures
-
-
-def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
-    """The exact 95 % interval of a share (Clopper and Pearson 1934)."""
-    from scipy.stats import binomtest
-
-    interval = binomtest(successes, trials).proportion_ci(confidence_level=0.95, method="exact")
-    return interval.low, interval.high
 
 
 def save_contact_sheet(config: CheckConfig) -> Path:

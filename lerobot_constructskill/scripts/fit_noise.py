@@ -31,16 +31,20 @@ def fit_noise(config: FitNoiseConfig) -> str:
     import numpy as np
     import yaml
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.utils.device_utils import auto_select_torch_device
 
+    import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.demos.dart import fit_covariance, held_out, policy_errors
+    from lerobot_constructskill.study.agents import PolicyAgent
 
     dataset = LeRobotDataset(config.repo_id, root=config.root)
     generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
     episodes = config.episodes or held_out(dataset.num_episodes)
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
         raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
-    policy = _load_policy(config)
-    errors = [policy_errors(*policy, dataset, episode, generator["noise"]["phases"]) for episode in episodes]
+    agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
+    pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
+    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in episodes]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,
@@ -56,22 +60,6 @@ def fit_noise(config: FitNoiseConfig) -> str:
     config.out.write_text(f"# DART iteration {fitted_on['iteration']}.\n{yaml.safe_dump(generator, sort_keys=False)}")
     deviations = ", ".join(f"{1000 * value:.2f}" for value in np.sqrt(np.diag(covariance)))
     return f"Noise of {deviations} mm (x, y, z) from {fitted_on['frames']} frames: {config.out}"
-
-
-def _load_policy(config: FitNoiseConfig) -> tuple:
-    """The policy and its pre- and postprocessor, as LeRobot loads them."""
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-    from lerobot.utils.device_utils import auto_select_torch_device
-
-    import lerobot_constructskill.plugin  # noqa: F401
-
-    policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
-    policy_config.device = config.device or str(auto_select_torch_device())
-    policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
-    device = {"device_processor": {"device": policy_config.device}}
-    processors = make_pre_post_processors(policy_config, config.policy_path, preprocessor_overrides=device)
-    return policy.eval(), *processors
 
 
 def main() -> None:

@@ -61,8 +61,8 @@ class PolicyAgent:
         self.encoder = policy.backbone if isinstance(policy, FrozenViTChunkPolicy) else None
 
     @classmethod
-    def from_pretrained(cls, checkpoint: Path, device: str | None = None) -> "PolicyAgent":
-        """Load a checkpoint folder of any registered policy type."""
+    def from_pretrained(cls, checkpoint: Path | str, device: str | None = None) -> "PolicyAgent":
+        """Load a checkpoint folder, or a name on the Hub, of any registered policy type."""
         config = PreTrainedConfig.from_pretrained(checkpoint)
         config.device = device or config.device
         config.pretrained_path = checkpoint
