@@ -7,6 +7,8 @@ from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import torch
+
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.hashing import file_sha256
 from lerobot_constructskill.study.agents import Agent, PolicyAgent
@@ -38,6 +40,9 @@ def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
 
     A run that fails yields one row that says why.
     """
+    torch.set_flush_denormal(
+        True
+    )  # sharp keypoints underflow, and training slowed down to a fifth; threads inherit it
     try:
         failed = train(job) if _is_trained(job) else {}
         runs = [run for run in job.runs if run not in failed]
