@@ -61,6 +61,8 @@ def test_the_statistics_are_those_of_all_frames(recorded):
     assert list(json.loads((dataset.root / "meta" / "stats.json").read_text())) == sorted(dataset.meta.stats)
     np.testing.assert_allclose(stats["mean"], action.mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(stats["std"], action.std(axis=0), atol=1e-6)
+    state, of_state = table["observation.state"].astype(np.float64), dataset.meta.stats["observation.state"]
+    np.testing.assert_allclose(of_state["std"], state.std(axis=0), rtol=1e-3)  # one angle is pi and hardly moves
     for name, quantile in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
         np.testing.assert_allclose(stats[name], np.quantile(action, quantile, axis=0), atol=1e-3)
 
