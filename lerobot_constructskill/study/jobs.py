@@ -40,9 +40,8 @@ def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
 
     A run that fails yields one row that says why.
     """
-    torch.set_flush_denormal(
-        True
-    )  # sharp keypoints underflow, and training slowed down to a fifth; threads inherit it
+    # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
+    torch.set_flush_denormal(True)
     try:
         failed = train(job) if _is_trained(job) else {}
         runs = [run for run in job.runs if run not in failed]
