@@ -51,6 +51,15 @@ SIM_STATE = {
 DEMO_SEED_START = 1_000_000
 """First seed of a data set. LeRobot's evaluations start at the training seed or at 1000."""
 
+HELD_OUT_EVERY = 8
+"""One demonstration of so many is held out of training, the last of each group."""
+
+
+def held_out(n_episodes: int, every: int = HELD_OUT_EVERY) -> list[int]:
+    """Indices of the held-out demonstrations."""
+    return list(range(every - 1, n_episodes, every))
+
+
 REWARD_LIFTED, REWARD_PLACED = 0.5, 1.0
 """The reward of a step is the stage its episode has reached; 0 before the object is lifted."""
 

@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task
+from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task, held_out
 from lerobot_constructskill.data.dataset import DataSet
 from lerobot_constructskill.demos.columns import demonstration_features
-from lerobot_constructskill.demos.dart import held_out
 from lerobot_constructskill.demos.expert import Phase
 
 MEANINGS = {

@@ -12,14 +12,6 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
 from tqdm import tqdm
 
-HELD_OUT_EVERY = 8
-"""Every eighth episode is held out, the last of each eight, as in every training configuration here."""
-
-
-def held_out(n_episodes: int) -> list[int]:
-    """Indices of the held-out episodes."""
-    return [index for index in range(n_episodes) if index % HELD_OUT_EVERY == HELD_OUT_EVERY - 1]
-
 
 def policy_errors(
     policy: PreTrainedPolicy,

@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.scripts.console import run
 
@@ -34,7 +35,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot.utils.device_utils import auto_select_torch_device
 
     import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.demos.dart import fit_covariance, held_out, policy_errors
+    from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
     from lerobot_constructskill.study.agents import PolicyAgent
 
     dataset = LeRobotDataset(config.repo_id, root=config.root)

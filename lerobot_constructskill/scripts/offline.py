@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from glob import glob
 from pathlib import Path
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.hashing import data_sha256, file_sha256
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.staging import replaced
@@ -45,8 +46,6 @@ def evaluate_offline(config: OfflineConfig) -> str:
         ValueError: no such episodes.
     """
     from lerobot.datasets import LeRobotDataset
-
-    from lerobot_constructskill.demos.dart import held_out
 
     checkpoints = _find(config.policies)
     dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)

@@ -12,6 +12,7 @@ from typing import Any
 import draccus
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.staging import staged
 from lerobot_constructskill.study.plan import Run, StudyPlan, Training
@@ -141,7 +142,7 @@ def _validation_sets(
 
 def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, Any], training: Training) -> None:
     """Train any other policy type with lerobot-train, for as many passes over the same demonstrations."""
-    kept = [i for i in range(dataset.num_episodes) if i % training.holdout != training.holdout - 1]
+    kept = sorted({*range(dataset.num_episodes)} - {*held_out(dataset.num_episodes, training.holdout)})
     frames = sum(dataset.meta.episodes["length"][i] for i in kept)
     steps = training.epochs * -(-frames // training.batch_size)
     with staged(job.folder(run)) as folder:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Any
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import HELD_OUT_EVERY, get_task
 
 REFERENCES = ("no_op", "random", "replay", "blind", "untrained", "expert")
 """Floors and ceilings that a study can run beside its variants."""
@@ -59,12 +59,12 @@ class Training:
     Args:
         epochs: passes over the demonstrations that are not held out.
         batch_size: frames per step.
-        holdout: every so many-th demonstration is held out (index % holdout == holdout - 1).
+        holdout: one demonstration of so many is held out.
     """
 
     epochs: int = 150
     batch_size: int = 256
-    holdout: int = 8
+    holdout: int = HELD_OUT_EVERY
 
 
 @dataclass(frozen=True)

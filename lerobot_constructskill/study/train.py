@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 from tqdm import tqdm
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import open_patches
 from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads, chunk_errors
@@ -62,7 +63,7 @@ def heldout_mse(
     Args:
         policies: they differ in their heads alone.
         dataset: any feature set with the inputs of the policies' own, by the same encoder.
-        holdout: every so many-th demonstration is held out, as in `Training`.
+        holdout: one demonstration of so many is held out, as in `Training`.
         stats: statistics of the set that they were trained on.
     """
     is_heldout = _is_heldout(dataset, holdout)
@@ -93,7 +94,7 @@ class _Order:
 
 def _is_heldout(dataset: LeRobotDataset, holdout: int) -> Tensor:
     """Which rows (N,) belong to a demonstration that is held out."""
-    return _episodes(dataset) % holdout == holdout - 1
+    return torch.isin(_episodes(dataset), torch.tensor(held_out(dataset.num_episodes, holdout), dtype=torch.int64))
 
 
 def _episodes(dataset: LeRobotDataset) -> Tensor:

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from lerobot_constructskill.demos.dart import fit_covariance, held_out
+from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.demos.dart import fit_covariance
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 
