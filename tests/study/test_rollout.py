@@ -93,9 +93,9 @@ class Sightless(Broken):
 
     encoder = encoder_key = "one that is never used"
 
-    def __init__(self, action, **policy):
+    def __init__(self, action):
         super().__init__(action)
-        self.policy = SimpleNamespace(**policy)
+        self.policy = SimpleNamespace()
 
     def reset(self, seed):
         if self.action is None:

@@ -156,6 +156,7 @@ def test_finished_runs_are_kept_in_the_order_of_the_plan(tmp_path):
     assert [*zip(rows["setting"], rows["variant"], rows["training_seed"], strict=True)] == [
         (run.setting, run.variant, run.seed) for run in of.runs
     ]
+    assert not (tmp_path / "study" / "data").exists()
 
 
 def test_a_seed_that_cannot_be_trained_takes_no_other_with_it(tmp_path, monkeypatch):
