@@ -1,6 +1,7 @@
 """`constructskill-offline`: what any LeRobot policies predict on held-out demonstrations, a row a checkpoint."""
 
 import json
+import re
 from dataclasses import asdict, dataclass
 from glob import glob
 from pathlib import Path
@@ -95,8 +96,12 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 
 def _training_seed(checkpoint: Path) -> int | None:
+    """As `lerobot-train` keeps it, or as a study names the checkpoint's folder."""
     path = checkpoint / "train_config.json"
-    return json.loads(path.read_text()).get("seed") if path.is_file() else None
+    if path.is_file():
+        return json.loads(path.read_text()).get("seed")
+    named = re.fullmatch(r"seed_(\d+)", checkpoint.absolute().parent.name)
+    return int(named[1]) if named else None
 
 
 def _write(rows: list[dict], folder: Path) -> str:

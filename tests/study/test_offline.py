@@ -113,11 +113,13 @@ def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_s
     """Of chunks of one step the error is that which training found on the same held-out episodes."""
     trained = train_seeds(config(chunk_size=1), feature_set, [0, 1], Training(epochs=3, batch_size=16, holdout=4))
     for policy, seed in zip(trained, [0, 1], strict=True):
-        save_checkpoint(policy, feature_set, tmp_path / f"seed_{seed}")
-    asked = OfflineConfig([f"{tmp_path}/seed_*"], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
+        save_checkpoint(policy, feature_set, tmp_path / f"seed_{seed}" / "pretrained_model")
+    found = f"{tmp_path}/seed_*/pretrained_model"
+    asked = OfflineConfig([found], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
     printed = evaluate_offline(asked)
     rows, table = json.loads((tmp_path / "offline.json").read_text()), pd.read_parquet(tmp_path / "offline.parquet")
     assert "n/a" in printed and [row["policy"] for row in rows] == ["frozen_vit"] * 2
+    assert list(table["training_seed"]) == [0, 1]
     assert list(table["rmse_m"]) == [row["rmse_m"] for row in rows]
     errors = heldout_mse(trained, feature_set, 4, feature_set.meta.stats)
     for row, error in zip(rows, errors, strict=True):
