@@ -78,6 +78,7 @@ def error_figure(setting: SettingFindings, plan: StudyPlan) -> Drawing | None:
     lines = [line for line in setting.lines if line.error is not None]
     if not lines:
         return None
+    errors = np.concatenate([line.runs["heldout_mse_m2"].dropna() for line in lines])
 
     def draw(ink: Ink) -> Figure:
         figure, axes = panels(3.5 + 0.18 * (len(lines) // 4), sharex=True, sharey=True)
@@ -99,6 +100,10 @@ def error_figure(setting: SettingFindings, plan: StudyPlan) -> Drawing | None:
             axis.set(title=criterion.capitalize(), xlabel="held-out translation error (10⁻⁴ m²)")
             axis.grid(axis="y", linewidth=0.6)
             axis.set_axisbelow(True)
+        if errors.max() > 10 * errors.min() > 0:
+            for axis in axes:
+                axis.set_xscale("log")
+                axis.xaxis.set_major_formatter("{x:g}")
         axes[0].set_ylabel(f"episodes of {plan.episodes}")
         axes[0].set_ylim(-0.08 * plan.episodes, 1.08 * plan.episodes)
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)

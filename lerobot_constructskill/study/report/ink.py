@@ -54,7 +54,8 @@ DARK = Ink(
     alarm="#f08a56",
     series=("#4ba8e0", "#f0854a", "#3cc79c", "#dd8fc6", "#e8b04a", "#9fd3f2", "#a8b2ba"),
 )
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", ">")
+"""One more than `series` has colours, so that their pairs repeat after 56 variants only."""
 
 WIDTH = 9.2
 """Inches: at 100 dots an inch, the width of the page's text."""
