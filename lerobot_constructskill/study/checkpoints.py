@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -26,6 +27,9 @@ TRAINED = ("blind", "untrained")
 logger = logging.getLogger(__name__)
 
 HELDOUT_FILE = "heldout_mse_m2.json"
+
+LOADERS = 4
+"""LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
 
 
 @dataclass(frozen=True)
@@ -157,6 +161,7 @@ def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, 
             f"--steps={steps}",
             f"--save_freq={steps}",
             "--env_eval_freq=0",
+            f"--num_workers={min(os.cpu_count() - 1, LOADERS)}",
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]
