@@ -161,7 +161,7 @@ def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, 
             f"--steps={steps}",
             f"--save_freq={steps}",
             "--env_eval_freq=0",
-            f"--num_workers={min(os.cpu_count() - 1, LOADERS)}",
+            f"--num_workers={min((os.cpu_count() or 1) - 1, LOADERS)}",
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]

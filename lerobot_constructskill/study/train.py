@@ -94,7 +94,8 @@ class _Order:
 
 def _is_heldout(dataset: LeRobotDataset, holdout: int) -> Tensor:
     """Which rows (N,) belong to a demonstration that is held out."""
-    return torch.isin(_episodes(dataset), torch.tensor(held_out(dataset.num_episodes, holdout), dtype=torch.int64))
+    episodes = torch.tensor(held_out(dataset.meta.total_episodes, holdout), dtype=torch.int64)
+    return torch.isin(_episodes(dataset), episodes)
 
 
 def _episodes(dataset: LeRobotDataset) -> Tensor:
