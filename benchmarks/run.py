@@ -31,7 +31,7 @@ def prepare() -> None:
         run("constructskill-generate", config, "--repo_id=local/fast", f"--root={demonstrations}")
     if not features.exists():
         source = ["--repo_id=local/fast", f"--root={demonstrations}", f"--out_root={features}"]
-        run("constructskill-encode", *source, "--backbone_precision=bfloat16")
+        run("constructskill-encode", *source)
 
 
 def measure(name: str) -> list[dict]:

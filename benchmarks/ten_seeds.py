@@ -12,7 +12,7 @@ from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import 
 from lerobot_constructskill.study.plan import Training
 from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
 
-DINOV2 = {"backbone_precision": "bfloat16", "standardize_features": True}  # configs/train/frozen_vit_fast.yaml
+DINOV2 = {"standardize_features": True}  # configs/train/frozen_vit_fast.yaml
 
 
 def main(folder: Path, n_seeds: int, batch_size: int, weights: str | None = None) -> None:

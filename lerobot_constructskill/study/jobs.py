@@ -123,8 +123,11 @@ def _versions() -> dict[str, str]:
 
 
 def _backbone(config_file: Path) -> dict[str, str]:
-    """Where a frozen_vit checkpoint's backbone came from, whose weights are none of the checkpoint's."""
+    """What a frozen_vit checkpoint's backbone is, whose weights are none of the checkpoint's."""
     config = json.loads(config_file.read_text()) if config_file.exists() else {}
     if not config.get("backbone_sha256"):
         return {}
-    return {config["backbone"]: f"{config['backbone_source']}, SHA-256 {config['backbone_sha256'][:12]}"}
+    precision, trained = config["backbone_precision"], config["backbone_trained_precision"]
+    crossed = f", trained in {trained}" if trained != precision else ""
+    source = f"{config['backbone_source']}, SHA-256 {config['backbone_sha256'][:12]}"
+    return {config["backbone"]: f"{source}, {precision}{crossed}"}

@@ -23,6 +23,7 @@ from lerobot_constructskill.features.encode import PARTS, load_encoder, write_fe
 from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.precision import AUTO
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.staging import replaced, staged
 
@@ -82,7 +83,7 @@ class Store:
         encoder, info = load_encoder(
             policy.get("backbone", "dinov2_vits14"),
             policy.get("backbone_path"),
-            policy.get("backbone_precision", "float32"),
+            policy.get("backbone_trained_precision") or policy.get("backbone_precision", AUTO),
             policy.get("crop"),
             policy.get("device") or auto_select_torch_device(),
         )

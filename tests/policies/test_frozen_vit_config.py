@@ -18,7 +18,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
     ("fields", "said"),
     [
         ({"backbone": "resnet18"}, "dinov2_vits14, clip_vitb16, vit_tiny16, vit_tiny16_augreg"),
-        ({"backbone_precision": "float16"}, "float32, bfloat16"),
+        ({"backbone_precision": "float16"}, "auto, float32, bfloat16"),
         ({"gripper_head": "mse"}, "bce, regression"),
         ({"chunk_size": 0}, "at least 1, got 0"),
         ({"n_action_steps": 9, "temporal_ensemble_coeff": None}, "between 1 and chunk_size=8, got 9"),

@@ -51,14 +51,16 @@ class Backbone:
 def _build_dinov2_small() -> nn.Module:
     from transformers import Dinov2Config, Dinov2Model
 
-    return Dinov2Model(
-        Dinov2Config(
-            hidden_size=384,
-            num_hidden_layers=12,
-            num_attention_heads=6,
-            image_size=518,
-            patch_size=14,
-            use_mask_token=False,  # used in pretraining only, and not every source ships it
+    return _without_loss(
+        Dinov2Model(
+            Dinov2Config(
+                hidden_size=384,
+                num_hidden_layers=12,
+                num_attention_heads=6,
+                image_size=518,
+                patch_size=14,
+                use_mask_token=False,  # used in pretraining only, and not every source ships it
+            )
         )
     )
 
@@ -66,17 +68,27 @@ def _build_dinov2_small() -> nn.Module:
 def _build_clip_vitb16() -> nn.Module:
     from transformers import CLIPVisionConfig, CLIPVisionModel
 
-    return CLIPVisionModel(
-        CLIPVisionConfig(
-            hidden_size=768,
-            intermediate_size=3072,
-            num_hidden_layers=12,
-            num_attention_heads=12,
-            image_size=224,
-            patch_size=16,
-            hidden_act="quick_gelu",
+    return _without_loss(
+        CLIPVisionModel(
+            CLIPVisionConfig(
+                hidden_size=768,
+                intermediate_size=3072,
+                num_hidden_layers=12,
+                num_attention_heads=12,
+                image_size=224,
+                patch_size=16,
+                hidden_act="quick_gelu",
+            )
         )
     )
+
+
+def _without_loss(model: nn.Module) -> nn.Module:
+    """Settle the loss of a transformers model and its parts, which warn of it when a tracer reads all attributes."""
+    for module in model.modules():
+        if hasattr(type(module), "loss_function"):
+            module.loss_function = None
+    return model
 
 
 def _build_vit_tiny16() -> nn.Module:

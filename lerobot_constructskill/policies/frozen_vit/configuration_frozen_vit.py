@@ -9,8 +9,8 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from .backbones import IMAGE_SIZE, get_backbone
-from .encoder import PRECISIONS
 from .features import feature_key
+from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
@@ -36,7 +36,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         backbone_source: written by the policy: where the weights came from.
         backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
             set, they must be those that made it) and checked whenever the checkpoint is loaded.
-        backbone_precision: "float32", or "bfloat16" to run the backbone under autocast.
+        backbone_precision: what the backbone computes in: "float32", "bfloat16", or "auto", which becomes that of the
+            feature set, or else the fastest that the device does natively.
+        backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. A
+            `backbone_precision` other than this one is a crossing, which is logged with the drift of the features.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
@@ -84,7 +87,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_path: str | None = None
     backbone_source: str | None = None
     backbone_sha256: str | None = None
-    backbone_precision: str = "float32"
+    backbone_precision: str = AUTO
+    backbone_trained_precision: str | None = None
     save_backbone: bool = True
     camera: str = "base"
     crop: list[float] | None = None
@@ -108,7 +112,9 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         super().__post_init__()
         self._feature_column: dict[str, Any] | None = None
         get_backbone(self.backbone)
-        _check_choice("backbone_precision", self.backbone_precision, PRECISIONS)
+        _check_choice("backbone_precision", self.backbone_precision, (AUTO, *PRECISIONS))
+        if self.backbone_trained_precision is not None:
+            _check_choice("backbone_trained_precision", self.backbone_trained_precision, PRECISIONS)
         _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)
         _check_choice("readout", self.readout, tuple(READOUTS))
         _check_crop(self.crop)

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from . import openvino
 from .backbones import IMAGE_SIZE, Backbone
-
-PRECISIONS = ("float32", "bfloat16")
+from .precision import is_native
 
 Crop = Sequence[float]
 """Left, top, right and bottom edge of the part of an image that is looked at, in shares of its width and height."""
@@ -21,8 +20,8 @@ class FrozenEncoder(nn.Module):
 
     Args:
         backbone: the registry entry to build, with random weights until a state dict is loaded into `model`.
-        precision: "float32" (PyTorch), or "bfloat16" (features stay float32): autocast, and on a CPU OpenVINO where
-            it is installed.
+        precision: one of `precision.PRECISIONS` (features are float32 in either). OpenVINO computes it on a CPU
+            that does it natively, where OpenVINO is installed; elsewhere PyTorch, bfloat16 by autocast.
         crop: the part of every image that is encoded; None takes it all. The patches of a part are finer.
     """
 
@@ -70,12 +69,24 @@ class FrozenEncoder(nn.Module):
         pixels = self.preprocess(images)
         if self._is_compiled_for(pixels.device):
             if self._compiled is None:
-                self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE)
+                self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
             return self._compiled(pixels)
-        low = self.precision == "bfloat16"
-        with torch.autocast(pixels.device.type, dtype=torch.bfloat16, enabled=low):
+        return self._encode_eagerly(pixels, self.precision)
+
+    @torch.no_grad()
+    def _encode_eagerly(self, pixels: Tensor, precision: str) -> tuple[Tensor, Tensor]:
+        with torch.autocast(pixels.device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16"):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()
+
+    def drift(self, images: Tensor, precision: str) -> float:
+        """How far the patch features of images are from those in another precision, in shares of their norm.
+
+        PyTorch computes the other ones, also where they have to be emulated.
+        """
+        ours = self.encode(images)[1]
+        theirs = self._encode_eagerly(self.preprocess(images), precision)[1]
+        return ((ours - theirs).norm() / theirs.norm()).item()
 
     def preprocess(self, images: Tensor) -> Tensor:
         """Crop, resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
@@ -91,7 +102,7 @@ class FrozenEncoder(nn.Module):
         return (images - self.mean) / self.std
 
     def _is_compiled_for(self, device: torch.device) -> bool:
-        return self.precision == "bfloat16" and device.type == "cpu" and openvino.is_installed()
+        return device.type == "cpu" and openvino.is_installed() and is_native(self.precision, device)
 
     def _forget_compiled(self) -> None:
         self._compiled = None

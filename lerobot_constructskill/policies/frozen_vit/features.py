@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .backbones import IMAGE_SIZE, Backbone
+from .precision import PRECISIONS
 
 FEATURE_PREFIX = "observation.features."
 
@@ -61,12 +62,18 @@ def describe(
     }
 
 
+def made_in(column: Mapping | None) -> str | None:
+    """The precision of a feature column's encoder; None where there is no column or it does not say."""
+    found = ((column or {}).get("info") or {}).get("precision")
+    return found if found in PRECISIONS else None
+
+
 def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> None:
     """Refuse a feature column that another encoder made.
 
     Args:
         column: the column's entry in the data set's `features`.
-        expected: `describe` of the policy's encoder.
+        expected: `describe` of the encoder whose features the policy was, or is to be, trained on.
         dim: length D of its features.
 
     Raises:

@@ -15,8 +15,9 @@ from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
 from .ensembling import ensemble
-from .features import check_features, describe, open_patches
+from .features import check_features, describe, made_in, open_patches
 from .heads import ChunkErrors, ChunkHeads, chunk_errors
+from .precision import check_native, resolve_precision
 from .readouts import READOUTS
 from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
@@ -57,12 +58,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         self.config = config
+        self._settle_precision()
         spec = get_backbone(config.backbone)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop)
         if load_backbone:
+            check_native(config.backbone_precision, config.device)
             self._load_backbone()
         if config.feature_column is not None:
-            expected = describe(spec, config.backbone_sha256, config.backbone_precision, config.crop)
+            expected = describe(spec, config.backbone_sha256, config.backbone_trained_precision, config.crop)
             check_features(config.feature_column, expected, spec.feature_dim)
         self.readout = READOUTS[config.readout]
         self.patches_root = dataset_meta.root if dataset_meta is not None else None
@@ -79,6 +82,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.register_load_state_dict_post_hook(_excuse_backbone)
         self._heldout = [0.0, 0]
         self._heldout_report: dict[str, float] = {}
+        self._has_seen = False
         self.reset()
 
     def fresh_heads(self) -> ChunkHeads:
@@ -125,6 +129,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
         """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
+        if mode and self.config.feature_column is None:  # images: what the heads learn from is our own
+            self.config.backbone_trained_precision = self.backbone.precision
         total, count = self._heldout
         if mode and count:
             self._heldout = [0.0, 0]
@@ -182,6 +188,19 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             "frozen_vit trains two linear layers on a frozen backbone; PEFT has nothing to adapt."
         )
 
+    def _settle_precision(self) -> None:
+        config = self.config
+        trained = made_in(config.feature_column) or config.backbone_trained_precision
+        config.backbone_precision = resolve_precision(config.backbone_precision, config.device, trained)
+        config.backbone_trained_precision = trained or config.backbone_precision
+
+    def _log_crossing(self, image: Tensor) -> None:
+        precision, trained = self.config.backbone_precision, self.config.backbone_trained_precision
+        if precision != trained:
+            crossing = f"frozen_vit, trained on features in {trained}, acts on features in {precision}"
+            share = 100 * self.backbone.drift(image, trained)
+            logger.warning("%s; on its first image they differ by %.2f %% of their norm.", crossing, share)
+
     def _load_backbone(self) -> None:
         config = self.config
         wanted = config.backbone_sha256 or _encoders_sha256(config.feature_column)
@@ -225,7 +244,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             )
 
     def pool(self, images: Tensor) -> Tensor:
-        """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1]."""
+        """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
+
+        Raises:
+            ValueError: a checkpoint's precision, which this device would have to emulate.
+        """
+        if not self._has_seen:
+            check_native(self.config.backbone_precision, self.config.device)
+            self._log_crossing(images[:1])
+            self._has_seen = True
         return self.readout.pool(*self.backbone.encode(images))
 
     def head_inputs(self, batch: dict[str, Tensor]) -> tuple[Tensor, ...]:

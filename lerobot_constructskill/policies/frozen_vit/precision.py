@@ -1,0 +1,60 @@
+"""The number format that a backbone computes in: what a device does natively, and what `auto` means on it."""
+
+import os
+
+import torch
+
+PRECISIONS = ("float32", "bfloat16")
+
+AUTO = "auto"
+"""That of the feature set or checkpoint, where there is one, or else the fastest that the device does natively."""
+
+ISA_CAP = "ONEDNN_MAX_CPU_ISA"
+"""Environment variable that keeps the kernels of PyTorch and OpenVINO from newer instructions than a CPU may have."""
+
+WITHOUT_BFLOAT16 = ("SSE41", "AVX", "AVX2", "AVX2_VNNI", "AVX2_VNNI_2", "AVX512_CORE", "AVX512_CORE_VNNI")
+"""Values of `ISA_CAP` whose instruction sets do not multiply in bfloat16 (oneDNN, "CPU Dispatcher Control")."""
+
+
+def native_precision(device: torch.device | str = "cpu") -> str:
+    """Return the fastest precision that a device does natively.
+
+    A CPU does bfloat16 with AVX512-BF16 or AMX. Others emulate it, slower than they do float32: with OpenVINO 26 times
+    slower on two cores of an AMD EPYC whose kernels are capped, 60 times on a Xeon without it.
+    """
+    kind = torch.device(device).type
+    if kind == "cuda":
+        native = torch.cuda.is_bf16_supported(including_emulation=False)
+    else:
+        native = kind == "cpu" and _cpu_multiplies_bfloat16()
+    return "bfloat16" if native else "float32"
+
+
+def resolve_precision(asked: str, device: torch.device | str, made_in: str | None = None) -> str:
+    """Return what `auto` means on a device, or for what was `made_in` one precision already; others as they are."""
+    return (made_in or native_precision(device)) if asked == AUTO else asked
+
+
+def check_native(precision: str, device: torch.device | str) -> None:
+    """Refuse a precision that a device would have to emulate.
+
+    Raises:
+        ValueError: the device does not do it natively.
+    """
+    if not is_native(precision, device):
+        raise ValueError(
+            f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
+            "backbone_precision=auto, which is float32 here, or float32; a feature set or checkpoint that was made in "
+            f"{precision} runs with --policy.backbone_precision=float32, which logs how far the features drift."
+        )
+
+
+def is_native(precision: str, device: torch.device | str) -> bool:
+    return precision in ("float32", native_precision(device))
+
+
+def _cpu_multiplies_bfloat16() -> bool:
+    if os.environ.get(ISA_CAP, "").upper() in WITHOUT_BFLOAT16:
+        return False
+    found = torch.cpu.get_capabilities()
+    return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
