@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -137,7 +138,7 @@ def test_patch_features_on_request(source, weights, tmp_path):
 def test_the_description_travels_with_the_data_set(source, encoded, weights):
     info = json.loads((encoded.root / "meta" / "info.json").read_text())["features"][KEY]["info"]
     assert info == encoded.meta.features[KEY]["info"]
-    assert info["backbone"] == "vit_tiny16" and info["precision"] == "float32"
+    assert info["backbone"] == "vit_tiny16" and info["precision"] == precision.native_precision("cpu")
     assert info["weights_source"] == f"local {weights.name}" and info["source_repo_id"] == "local/source"
 
 
@@ -185,16 +186,23 @@ def test_a_readout_of_patches_trains_on_a_set_that_has_them(source, encoded, wei
     torch.testing.assert_close(policy.predict_action_chunk(batch), seen, atol=1e-4, rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("fields", "said"),
-    [
-        ({"backbone": "vit_tiny16_augreg"}, "backbone vit_tiny16 .the policy: vit_tiny16_augreg"),
-        ({"backbone_precision": "bfloat16"}, "precision float32 .the policy: bfloat16"),
-    ],
-)
-def test_features_of_another_encoder_are_refused(fields, said, encoded, weights):
-    with pytest.raises(ValueError, match=said):
-        make_policy(policy_config(weights, **fields), ds_meta=encoded.meta)
+def test_features_of_another_encoder_are_refused(encoded, weights):
+    with pytest.raises(ValueError, match="backbone vit_tiny16 .the policy: vit_tiny16_augreg"):
+        make_policy(policy_config(weights, backbone="vit_tiny16_augreg"), ds_meta=encoded.meta)
+
+
+def test_features_of_a_precision_that_is_missing_here_are_refused_unless_another_is_asked_for(
+    source, weights, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(precision, "_cpu_multiplies_bfloat16", lambda: True)
+    encode(settings(source, weights, tmp_path / "out"))
+    meta = LeRobotDataset("local/out", root=tmp_path / "out").meta
+    assert make_policy(policy_config(weights), ds_meta=meta).backbone.precision == "bfloat16"
+    monkeypatch.setattr(precision, "_cpu_multiplies_bfloat16", lambda: False)
+    with pytest.raises(ValueError, match="only emulate bfloat16"):
+        make_policy(policy_config(weights), ds_meta=meta)
+    crossing = make_policy(policy_config(weights, backbone_precision="float32"), ds_meta=meta).config
+    assert (crossing.backbone_precision, crossing.backbone_trained_precision) == ("float32", "bfloat16")
 
 
 def test_features_of_other_weights_are_refused(encoded, tmp_path):

@@ -1,0 +1,99 @@
+"""What `auto` becomes, what is refused and how a checkpoint crosses over, on both kinds of CPU on either."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.policies.frozen_vit import precision as precision_module
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, WITHOUT_BFLOAT16, native_precision
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Make this CPU one that multiplies in bfloat16 natively, or one that does not, as far as our choices go."""
+
+    def be(native: str) -> None:
+        monkeypatch.setattr(precision_module, "_cpu_multiplies_bfloat16", lambda: native == "bfloat16")
+
+    return be
+
+
+def test_a_capped_cpu_has_no_bfloat16(monkeypatch):
+    for cap in WITHOUT_BFLOAT16:
+        monkeypatch.setenv(ISA_CAP, cap.lower())
+        assert native_precision("cpu") == "float32"
+
+
+@pytest.mark.parametrize("native", ["float32", "bfloat16"])
+def test_auto_is_the_native_precision_and_recorded(native, machine, make_policy, tmp_path):
+    machine(native)
+    make_policy().save_pretrained(tmp_path)
+    recorded = json.loads((tmp_path / "config.json").read_text())
+    assert recorded["backbone_precision"] == recorded["backbone_trained_precision"] == native
+
+
+def test_bfloat16_by_name_is_refused_where_it_would_be_emulated(machine, make_policy, weights):
+    machine("float32")
+    for call in (
+        lambda: make_policy(backbone_precision="bfloat16"),
+        lambda: load_encoder("vit_tiny16", str(weights("vit_tiny16")), "bfloat16"),
+    ):
+        with pytest.raises(ValueError, match=r"60 times slower .* backbone_precision=auto, .* or float32") as refusal:
+            call()
+        assert "\n" not in str(refusal.value)
+
+
+def test_a_checkpoint_keeps_its_precision_where_another_would_be_faster(machine, make_policy, tmp_path):
+    machine("float32")
+    make_policy().save_pretrained(tmp_path)
+    machine("bfloat16")
+    assert FrozenViTChunkPolicy.from_pretrained(tmp_path).config.backbone_precision == "float32"
+
+
+def test_a_checkpoint_crosses_over_on_purpose_alone(machine, make_policy, images, tmp_path, caplog):
+    machine("bfloat16")
+    make_policy().save_pretrained(tmp_path / "made")
+    machine("float32")
+    batch = {"observation.images.base": images}
+    stranded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "made")  # so that it can be pushed from here
+    with pytest.raises(ValueError, match="checkpoint that was made in bfloat16 runs with --policy.backbone_precision="):
+        stranded.select_action(batch)
+    config = FrozenViTChunkConfig.from_pretrained(tmp_path / "made", cli_overrides=["--backbone_precision=float32"])
+    crossed = FrozenViTChunkPolicy.from_pretrained(tmp_path / "made", config=config)
+    for _ in range(2):
+        crossed.select_action(batch)
+    assert caplog.text.count("trained on features in bfloat16, acts on features in float32") == 1
+    crossed.save_pretrained(tmp_path / "crossed")
+    recorded = json.loads((tmp_path / "crossed" / "config.json").read_text())
+    assert (recorded["backbone_precision"], recorded["backbone_trained_precision"]) == ("float32", "bfloat16")
+
+
+def test_what_is_trained_further_on_images_is_of_the_precision_it_saw(machine, make_policy):
+    machine("bfloat16")
+    policy = make_policy(backbone_precision="float32", backbone_trained_precision="bfloat16")
+    assert policy.eval().config.backbone_trained_precision == "bfloat16"
+    assert policy.train().config.backbone_trained_precision == "float32"
+
+
+@pytest.mark.slow
+def test_under_the_other_kinds_instructions_float32_is_close_to_ours(weights, images, tmp_path):
+    """The kernels really are capped here, which takes a process of its own."""
+    code = (
+        "import sys, torch; from lerobot_constructskill.features.encode import load_encoder;"
+        f"encoder, info = load_encoder('vit_tiny16', {str(weights('vit_tiny16'))!r});"
+        "print(info['precision'], info['runtime']); torch.save(encoder(torch.load(sys.argv[1])), sys.argv[2])"
+    )
+    torch.save(images, tmp_path / "images")
+    files = [str(tmp_path / "images"), str(tmp_path / "features")]
+    capped = os.environ | {ISA_CAP: "AVX2"}
+    done = subprocess.run([sys.executable, "-c", code, *files], env=capped, capture_output=True, text=True, check=True)
+    encoder, info = load_encoder("vit_tiny16", str(weights("vit_tiny16")), "float32")
+    assert done.stdout.split() == ["float32", info["runtime"]]
+    torch.testing.assert_close(torch.load(files[1]), encoder(images), atol=1e-4, rtol=0)
