@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import draccus
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.device_utils import auto_select_torch_device
@@ -21,6 +20,7 @@ from lerobot_constructskill.demos.recorder import record
 from lerobot_constructskill.demos.settings import GenerateConfig, provenance
 from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 from lerobot_constructskill.hashing import data_sha256
+from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
@@ -67,7 +67,7 @@ class Store:
         if not Path(config_file).is_file():
             raise FileNotFoundError(f"There is no constructskill-generate configuration '{config_file}'.")
         name = Path(config_file).stem
-        config = draccus.parse(GenerateConfig, config_path=config_file, args=[f"--repo_id=local/{name}"])
+        config = parse(GenerateConfig, [f"--repo_id=local/{name}"], config_file)
         return config, self.root / f"{name}-{_digest(provenance(config))}"
 
     def features(self, demonstrations: LeRobotDataset, policy: dict[str, Any], blind: bool = False) -> LeRobotDataset:

@@ -16,6 +16,7 @@ import pandas as pd
 import yaml
 from tqdm import tqdm
 
+from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.pools import open_pool
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.checkpoints import Job
@@ -112,7 +113,7 @@ def _claimed(root: Path) -> Iterator[None]:
 
 def _write_plan(plan: StudyPlan, root: Path) -> None:
     path = root / PLAN
-    if path.exists() and draccus.decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
+    if path.exists() and decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
         raise ValueError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
     with replaced(path) as partial:
         partial.write_text(yaml.safe_dump(draccus.encode(plan), sort_keys=False))
