@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import full_traceback
 
 PRELOADED = ["lerobot_constructskill.sim.register", "lerobot_constructskill.study.simulators"]
 """Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
@@ -133,4 +134,5 @@ def _attempt(verb: str, env: ConstructSkillEnv, argument: Any) -> Any:
     try:
         return _VERBS[verb](env, argument)
     except Exception as error:
+        error.add_note(full_traceback(error))  # an exception leaves its traceback behind when it leaves the process
         return error
