@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
-from tqdm import tqdm
+
+from lerobot_constructskill.progress import Progress
 
 
 def policy_errors(
@@ -29,7 +30,7 @@ def policy_errors(
     policy.reset()
     row = dataset.meta.episodes[episode]
     errors = []
-    for index in tqdm(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}", leave=False):
+    for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
         frame = dataset[index]
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         with torch.inference_mode():

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from tqdm import tqdm
-
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
 from lerobot_constructskill.pools import open_pool
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.staging import staged
 
 SHARDS = "shards"
@@ -65,12 +64,14 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
     """
     before, attempts, running = finished(shards), [], set()
     seeds = count(config.seed_start)
-    bar = tqdm(total=config.episodes, desc="demonstrations", unit="demo")
+    found = min(config.episodes, sum(outcome.success for outcome in before.values()))
+    # Smoothed: the start of the simulators, in the first demonstration's time, is forgotten by and by.
+    bar = Progress(total=config.episodes, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
     with bar, open_pool(config.executor, config.workers) as submit:
         while True:
             successes = sum(outcome.success for outcome in attempts)
             bar.set_postfix(discarded=len(attempts) - successes, refresh=False)
-            bar.update(successes - bar.n)
+            bar.update(max(0, successes - bar.n))
             _check_failures(config, len(attempts) - successes)
             if len(running) < min(config.episodes - successes, config.workers):
                 seed = next(seeds)

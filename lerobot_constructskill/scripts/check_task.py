@@ -59,16 +59,15 @@ def check(config: CheckConfig) -> str:
 
 def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
     """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
-    from tqdm import trange
-
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.progress import Progress
 
     env = ConstructSkillEnv(config.task, render_backend="none")
     expert = make_expert(get_task(config.task), config.expert)
     lengths, failures = [], []
-    for seed in trange(DEMO_SEED_START, DEMO_SEED_START + config.states, desc=config.task, unit="state"):
+    for seed in Progress(range(DEMO_SEED_START, DEMO_SEED_START + config.states), "expert", unit="state"):
         frames, success = demonstrate(env, expert, config.noise, seed)
         if success:
             lengths.append(len(frames))
@@ -86,16 +85,19 @@ def save_contact_sheet(config: CheckConfig) -> Path:
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.progress import Progress
 
     env = ConstructSkillEnv(config.task)
     expert = make_expert(get_task(config.task), config.expert)
     columns = {}
 
     def keep(phase, obs):
+        bar.update()
         if phase not in columns:
             columns[phase] = (obs["pixels"]["base"], env.render())
 
-    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
+    with Progress(desc="contact sheet", unit="step") as bar:
+        demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"

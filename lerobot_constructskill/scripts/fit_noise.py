@@ -36,6 +36,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
+    from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.study.agents import PolicyAgent
 
     dataset = LeRobotDataset(config.repo_id, root=config.root)
@@ -45,7 +46,8 @@ def fit_noise(config: FitNoiseConfig) -> str:
         raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
     agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
-    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in episodes]
+    bar = Progress(episodes, "demonstrations", unit="demo")
+    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,

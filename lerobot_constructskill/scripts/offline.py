@@ -48,6 +48,8 @@ def evaluate_offline(config: OfflineConfig) -> str:
     """
     from lerobot.datasets import LeRobotDataset
 
+    from lerobot_constructskill.progress import Progress
+
     checkpoints = _find(config.policies)
     dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)
     episodes = held_out(dataset.num_episodes) if config.episodes is None else config.episodes
@@ -59,7 +61,8 @@ def evaluate_offline(config: OfflineConfig) -> str:
         "dataset_revision": dataset.revision if config.root is None else None,
         "dataset_sha256": data_sha256(dataset.root),
     }
-    rows = [_row(path, dataset, episodes, config) | source for path in checkpoints]
+    bar = Progress(checkpoints, "policies", unit="policy")
+    rows = [_row(path, dataset, episodes, config) | source for path in bar]
     return _write(rows, config.out)
 
 

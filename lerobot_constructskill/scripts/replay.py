@@ -24,12 +24,11 @@ def replay_all(config: ReplayConfig) -> str:
         ValueError: no such episode, or outcomes that differ.
         OSError: this machine cannot render.
     """
-    from tqdm import tqdm
-
     from lerobot_constructskill.data.dataset import open_dataset
     from lerobot_constructskill.data.hub import locate
     from lerobot_constructskill.data.replay import replay
     from lerobot_constructskill.demos.expert import Phase
+    from lerobot_constructskill.progress import Progress
 
     data = open_dataset(locate(config.repo_id, config.root, config.revision))
     everything = range(len(data.episodes))
@@ -40,7 +39,7 @@ def replay_all(config: ReplayConfig) -> str:
     for phase in Phase:
         noise = added[phases == phase]
         print(f"{phase:<9} {len(noise):6} frames, added mean {noise.mean(0).round(2)} std {noise.std(0).round(2)} mm")
-    replays = {episode: replay(data, episode) for episode in tqdm(episodes, "replay", unit="demo")}
+    replays = {episode: replay(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:
         raise ValueError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")

@@ -14,10 +14,10 @@ from pathlib import Path
 import draccus
 import pandas as pd
 import yaml
-from tqdm import tqdm
 
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.pools import open_pool
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.checkpoints import Job
 from lerobot_constructskill.study.jobs import execute
@@ -60,7 +60,7 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
         earlier, start = _wall_time(root), time.monotonic()
         runs = [*plan.reference_runs, *plan.runs]
         finished = [run for run in runs if _is_finished(root, run, options)]
-        with tqdm(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
+        with Progress(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
             for run, rows in _execute(_jobs(plan, root, store, runs, finished, options.together), options):
                 write_rows(rows, _row_file(root, run))
                 _merge(root, runs)
