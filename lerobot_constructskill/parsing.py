@@ -24,7 +24,7 @@ def parse[Config](
         InputError: they do not make a configuration.
         OSError: the file cannot be opened.
     """
-    with _refused():
+    with as_input():
         return ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
 
 
@@ -34,15 +34,16 @@ def decode[Config](config_class: type[Config], fields: Mapping[str, Any]) -> Con
     Raises:
         InputError: they do not make one.
     """
-    with _refused():
+    with as_input():
         return draccus.decode(config_class, fields)
 
 
 @contextmanager
-def _refused() -> Iterator[None]:
+def as_input() -> Iterator[None]:
+    """Turn what the block raises into an `InputError`, but for `OSError` and for errors of our own configurations."""
     try:
         yield
-    except OSError:
+    except (OSError, InputError):
         raise
     except (TypeError, AttributeError):  # draccus merges fields, and copies them, before it looks at them
         raise InputError("The configuration's file is empty or not a mapping of fields.") from None

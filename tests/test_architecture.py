@@ -42,7 +42,7 @@ ARROWS = {
     "study.stats": (),
     "study.report": ("contract", "parsing", "staging"),
     "study.train": ("contract", "policies"),
-    "study.agents": ("policies",),
+    "study.agents": ("parsing", "policies"),
     "study.offline": ("contract",),
     "study.simulators": ("envs",),
     "study.prepare": ("demos", "features", "hashing", "parsing", "policies", "staging"),

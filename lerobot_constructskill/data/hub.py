@@ -3,6 +3,12 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_constructskill.errors import InputError, MachineError, MissingError
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
@@ -43,19 +49,39 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
     return Path(folder)
 
 
+def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
+    """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
+
+    Raises:
+        FileNotFoundError: there is no data set in `root`.
+        ValueError: a file of it cannot be read.
+        OSError: the Hub does not have it, or cannot be reached.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    if root is not None and not (root / "meta" / "info.json").is_file():
+        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
+    try:
+        with one_sentence(repo_id, revision):
+            return LeRobotDataset(repo_id, root=root, revision=revision)
+    except (ValueError, LookupError) as error:
+        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({error}).") from error
+
+
 @contextmanager
 def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
     import httpx
+    from huggingface_hub.errors import HFValidationError
 
     try:
         yield
-    except (OSError, RuntimeError, httpx.HTTPError) as error:
+    except (OSError, RuntimeError, HFValidationError, httpx.HTTPError) as error:
         # An upload's own error is the cause of a bare RuntimeError.
         reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
         if reason is None:
             raise
-        raise OSError(reason) from None
+        raise MachineError(reason) from None
 
 
 def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
@@ -72,6 +98,10 @@ def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> 
         return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
     if isinstance(error, errors.HfHubHTTPError):
         return _refusal(repo_id, error.response.status_code)
+    if isinstance(error, errors.HFValidationError):
+        return f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."
+    if isinstance(error, httpx.ConnectError):
+        return f"The Hub cannot be reached for '{repo_id}'."
     if isinstance(error, httpx.HTTPError):
         return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
     return None

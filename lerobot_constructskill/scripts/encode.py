@@ -38,10 +38,10 @@ def encode(config: EncodeConfig) -> Path:
         FileNotFoundError: the data set or the backbone's weights cannot be had.
         OSError: the output folder cannot be written, which shows before anything is encoded.
     """
-    from lerobot.datasets import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
+    from lerobot_constructskill.data.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
     if config.batch_size < 1:
@@ -53,7 +53,7 @@ def encode(config: EncodeConfig) -> Path:
         encoder, info = load_encoder(
             config.backbone, config.backbone_path, config.backbone_precision, config.crop, device
         )
-        dataset = LeRobotDataset(config.repo_id, root=config.root)
+        dataset = open_lerobot(config.repo_id, config.root)
         write_feature_set(
             dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches
         )

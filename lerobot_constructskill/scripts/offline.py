@@ -46,12 +46,11 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
-    from lerobot.datasets import LeRobotDataset
-
+    from lerobot_constructskill.data.hub import open_lerobot
     from lerobot_constructskill.progress import Progress
 
     checkpoints = _find(config.policies)
-    dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)
+    dataset = open_lerobot(config.repo_id, config.root, config.revision)
     episodes = held_out(dataset.num_episodes) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
         raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
