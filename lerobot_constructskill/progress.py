@@ -1,6 +1,9 @@
 """The bars of everything that takes long: on a terminal their clocks move every second, a log gets fewer lines."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
+from io import StringIO
 from threading import Event, Thread
 
 from tqdm import tqdm
@@ -32,3 +35,13 @@ class Progress(tqdm):
     def _tick(self) -> None:
         while not self._closed.wait(TICK_S):
             self.refresh()
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what LeRobot and FFmpeg print from among our lines: a bar for each step, and how a codec fared."""
+    import av
+
+    av.logging.set_libav_level(av.logging.ERROR)
+    with redirect_stderr(StringIO()):
+        yield

@@ -73,7 +73,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 # Files that name every package they may import.
 EXTERNALS = {
     "errors": set(),
-    "progress": {"tqdm"},
+    "progress": {"av", "tqdm"},
     "contract": set(),
     "perturbations": set(),
     "staging": set(),

@@ -15,7 +15,7 @@ from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
 from lerobot_constructskill.pools import open_pool
-from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.staging import staged
 
 SHARDS = "shards"
@@ -52,7 +52,8 @@ def record(config: GenerateConfig) -> Summary:
     with staged(root, keep=SHARDS) as folder:
         shards = folder.with_name(SHARDS) / frames_digest(config)
         attempts = _run_attempts(config, shards)
-        merge(config, attempts, shards, folder)
+        with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
+            merge(config, attempts, shards, folder)
     lengths = [outcome.frames for outcome in attempts if outcome.success]
     return Summary(root, len(lengths), sum(lengths), [outcome.seed for outcome in attempts if not outcome.success])
 

@@ -73,8 +73,13 @@ def roll_out(
     """
     task = get_task(env_kwargs.get("task", "brick_to_bin"))
     longest = env_kwargs.get("episode_length") or task.horizon
-    with simulators(len(agents), env_kwargs, n_workers) as sims, Progress(unit="step", desc="rollout") as bar:
+    most = len(agents) * len(seeds) * longest
+    with (
+        simulators(len(agents), env_kwargs, n_workers) as sims,
+        Progress(total=most, unit="step", desc="rollout") as bar,
+    ):
         lanes = _Lanes(agents, task.instruction, sims, seeds, on_step)
+        bar.unpause()  # until now the simulators started
         while lanes.current:
             bar.total = bar.n + lanes.steps_left(longest)
             bar.update(len(lanes.current))
