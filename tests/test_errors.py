@@ -1,5 +1,6 @@
 """Whatever goes wrong in a console command: one sentence and a status for the user, the traceback in a log."""
 
+import ast
 import pickle
 import subprocess
 import sys
@@ -11,6 +12,8 @@ import pytest
 from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, full_traceback
 
 REPOSITORY = Path(__file__).parents[1]
+MODULES = sorted((REPOSITORY / "lerobot_constructskill").rglob("*.py"))
+PYTHONS = {"ValueError", "OSError", "FileNotFoundError", "FileExistsError"}
 COMMANDS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
 
 BREAK = """
@@ -46,8 +49,8 @@ def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, t
 
 
 def test_without_debug_a_fault_is_one_sentence(tmp_path: Path) -> None:
-    for _ in range(2):
-        done = run("constructskill-report", "KeyError('a')", tmp_path)
+    for error in "KeyError('a')", "ValueError('operands could not be broadcast together')":
+        done = run("constructskill-report", error, tmp_path)
         assert done.returncode == 70 and len(done.stderr.splitlines()) == 1
     assert (tmp_path / "constructskill" / "constructskill-report.log").read_text().count("Traceback") == 2
 
@@ -79,6 +82,13 @@ def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(tmp_path:
     done = run("constructskill-report", "KeyError('a')", tmp_path / "state")
     log = Path(done.stderr.strip().rsplit(" ", 1)[1])
     assert log.parent == tmp_path and "in broken\nKeyError: 'a'" in log.read_text()
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda path: path.stem)
+def test_what_is_raised_for_the_user_is_told_from_what_python_raises(module: Path) -> None:
+    raises = [node.exc for node in ast.walk(ast.parse(module.read_text())) if isinstance(node, ast.Raise)]
+    raised = {ast.unparse(error.func) for error in raises if isinstance(error, ast.Call)}
+    assert not raised & PYTHONS, "raise a class of errors.py, or RuntimeError where only a defect leads"
 
 
 @pytest.mark.parametrize("kind", [InputError, MissingError, TakenError, MachineError])

@@ -11,7 +11,7 @@ import pandas as pd
 
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.parsing import decode
 
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
@@ -99,7 +99,7 @@ def open_dataset(root: Path) -> DataSet:
         ValueError: a file that cannot be read, or that lacks what every data set has; the message names it.
     """
     if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"There is no data set in {root}: meta/info.json is missing.")
+        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
     tasks = _tables(root, "meta/tasks.parquet").reset_index()
     data = DataSet(
         root=root,
@@ -123,17 +123,17 @@ def _json(root: Path, name: str) -> Facts:
     try:
         return json.loads((root / name).read_text(), object_hook=partial(Facts, name))
     except (OSError, ValueError) as error:
-        raise ValueError(f"{name} cannot be read ({error}).") from None
+        raise InputError(f"{name} cannot be read ({error}).") from None
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:
     paths = sorted(root.glob(pattern))
     if not paths:
-        raise ValueError(f"{pattern} cannot be read (there is no such file).")
+        raise InputError(f"{pattern} cannot be read (there is no such file).")
     tables = []
     for path in paths:
         try:
             tables.append(pd.read_parquet(path))
         except (OSError, ValueError) as error:
-            raise ValueError(f"{path.relative_to(root)} cannot be read ({error}).") from None
+            raise InputError(f"{path.relative_to(root)} cannot be read ({error}).") from None
     return pd.concat(tables, ignore_index=len(paths) > 1)

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_constructskill.errors import InputError, MachineError, MissingError
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -24,10 +24,10 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
 
     if root is not None:
         if not root.is_dir():
-            raise FileNotFoundError(f"There is no folder {root}.")
+            raise MissingError(f"There is no folder {root}.")
         return root
     if repo_id is None:
-        raise ValueError("Name a data set with --repo_id, or its folder with --root.")
+        raise InputError("Name a data set with --repo_id, or its folder with --root.")
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
     return pull(repo_id, revision)
@@ -137,7 +137,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         api.create_repo(**repo, private=private, exist_ok=True)
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
         if CODEBASE_VERSION in tagged and not update:
-            raise FileExistsError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
+            raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
         commit = api.upload_folder(**repo, folder_path=root, ignore_patterns=[".cache/*"], delete_patterns=stale)
         for name in filter(None, (CODEBASE_VERSION, tag)):

@@ -11,6 +11,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
 
@@ -61,9 +62,9 @@ def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.n
     """
     errors = [error for error in errors if len(error)]
     if not errors:
-        raise ValueError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
+        raise InputError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
     if alpha is not None and not alpha > 0:
-        raise ValueError(f"alpha must be above 0 m2, not {alpha}.")
+        raise InputError(f"alpha must be above 0 m2, not {alpha}.")
     covariance = np.mean([error.T @ error / len(error) for error in errors], axis=0)
     if alpha is None:
         return covariance

@@ -14,6 +14,7 @@ from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
+from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.pools import open_pool
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.staging import staged
@@ -89,7 +90,7 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
 
 def _check_failures(config: GenerateConfig, failures: int) -> None:
     if failures > config.max_failures * config.episodes:
-        raise ValueError(
+        raise InputError(
             f"{failures} attempts failed, more than max_failures={config.max_failures} allows for "
             f"{config.episodes} demonstrations: check the expert's and the noise's values."
         )
@@ -102,7 +103,7 @@ def _check_disk(config: GenerateConfig, root: Path) -> None:
     disk = next(folder for folder in root.absolute().parents if folder.exists())
     free = shutil.disk_usage(disk).free
     if free < needed:
-        raise OSError(
+        raise MachineError(
             f"{disk} has {free / 1e6:,.0f} MB free and {config.episodes} episodes of up to {config.max_steps} steps "
             f"take up to {needed / 1e6:,.0f} MB: make room, name another root, or ask for fewer."
         )

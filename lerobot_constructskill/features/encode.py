@@ -18,6 +18,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import PRECISIONS, Crop, FrozenEncoder
@@ -46,7 +47,7 @@ def load_encoder(
     """
     spec = get_backbone(backbone)
     if precision not in PRECISIONS:
-        raise ValueError(f"backbone_precision must be one of {', '.join(PRECISIONS)}, got '{precision}'.")
+        raise InputError(f"backbone_precision must be one of {', '.join(PRECISIONS)}, got '{precision}'.")
     state, source = load_weights(spec, path)
     encoder = FrozenEncoder(spec, precision, crop)
     encoder.model.load_state_dict(state)
@@ -94,7 +95,7 @@ def _encode_frames(
     key = f"observation.images.{camera}"
     if key not in dataset.meta.camera_keys:
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
-        raise ValueError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
+        raise InputError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
     with tqdm(total=dataset.num_frames, unit="frame", desc=f"Encoding {camera}") as progress:
         for episode in dataset.meta.episodes:
             file = _part(parts, episode)

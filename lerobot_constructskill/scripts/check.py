@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -35,7 +36,7 @@ def check(config: CheckConfig) -> str:
         with Progress.external_write_mode():
             print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
     if wrong:
-        raise ValueError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
+        raise InputError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
     return f"{len(data.episodes)} demonstrations, {len(data.rows)} frames: {len(CHECKS)} checks, nothing wrong."
 
 

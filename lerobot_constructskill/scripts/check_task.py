@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 TILE = 224
@@ -35,7 +36,7 @@ class CheckConfig:
     def __post_init__(self):
         get_task(self.task)
         if self.states < 1:
-            raise ValueError(f"states must be at least 1, not {self.states}.")
+            raise InputError(f"states must be at least 1, not {self.states}.")
 
 
 def check(config: CheckConfig) -> str:
@@ -51,9 +52,9 @@ def check(config: CheckConfig) -> str:
         f"{get_task(config.task).horizon} steps. Look at {sheet}."
     )
     if len(failures) > (1 - REQUIRED) * config.states:
-        raise ValueError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
+        raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
     if config.tests and (code := run_tests(config.task)):
-        raise ValueError(f"{report} Its tests failed with status {code}; pytest tells why above.")
+        raise InputError(f"{report} Its tests failed with status {code}; pytest tells why above.")
     return report
 
 

@@ -61,7 +61,7 @@ def _judge(error: BaseException) -> tuple[int, str]:
     said = " ".join(str(error).split())
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
-    if isinstance(error, UserError | ValueError | OSError):
+    if isinstance(error, UserError | OSError):
         return REFUSED, said
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lerobot_constructskill"):
         return REFUSED, f"{said}; constructskill-doctor tells what is not installed"

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.staging import staged
 
@@ -45,7 +46,7 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
     if config.batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
+        raise InputError(f"batch_size must be at least 1, got {config.batch_size}.")
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:

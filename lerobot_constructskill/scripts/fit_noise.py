@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -43,7 +44,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
     episodes = config.episodes or held_out(dataset.num_episodes)
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
-        raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
     with one_sentence(config.policy_path):
         agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -34,7 +35,7 @@ def replay_all(config: ReplayConfig) -> str:
     everything = range(len(data.episodes))
     episodes = list(everything) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(everything):
-        raise ValueError(f"Name episodes among the {len(everything)} there are, not {episodes}.")
+        raise InputError(f"Name episodes among the {len(everything)} there are, not {episodes}.")
     added, phases = 1000 * data.column("dart.noise"), data.column("phase")
     for phase in Phase:
         noise = added[phases == phase]
@@ -42,7 +43,7 @@ def replay_all(config: ReplayConfig) -> str:
     replays = {episode: replay(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:
-        raise ValueError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")
+        raise InputError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")
     deviation = max(one.deviation for one in replays.values())
     return f"{len(replays)} demonstrations ended as recorded; no state is further than {deviation:.2g} from its own."
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.study.plan import StudyPlan
 
@@ -58,7 +59,7 @@ def study(config: StudyConfig) -> str:
     runs = rows.groupby(["setting", "variant", "training_seed"])["error"].first()
     if runs.notna().all():
         why = f"their tracebacks are in {root / 'logs'}; the first: {runs.iloc[0]}"
-        raise ValueError(f"All {len(runs)} runs failed; {why}")
+        raise InputError(f"All {len(runs)} runs failed; {why}")
     failed = f", {runs.notna().sum()} of them failed (why: {root / 'logs'})" if runs.notna().any() else ""
     return f"{len(runs)} runs{failed}: {root} (next: constructskill-report --root={root})"
 

@@ -14,7 +14,7 @@ from typing import Any
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.errors import full_traceback
+from lerobot_constructskill.errors import UserError, full_traceback
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.staging import staged
@@ -150,7 +150,7 @@ def _validation_sets(
     for data in job.plan.data_of(job.runs[0].setting):
         try:
             other = features if data == job.data else _features(job, data, policy, is_blind)
-        except (OSError, ValueError) as error:
+        except (OSError, UserError) as error:
             logger.warning("%s is not validated on %s: %s", job.runs[0].variant, data, error)
             job.keep(job.runs[0], error)
             continue

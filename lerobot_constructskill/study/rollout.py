@@ -69,7 +69,7 @@ def roll_out(
         An agent's number and its outcome, as soon as it has finished or failed.
 
     Raises:
-        RuntimeError: a simulator's process died.
+        OSError: a simulator's process died.
     """
     task = get_task(env_kwargs.get("task", "brick_to_bin"))
     longest = env_kwargs.get("episode_length") or task.horizon

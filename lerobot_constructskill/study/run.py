@@ -15,6 +15,7 @@ import draccus
 import pandas as pd
 import yaml
 
+from lerobot_constructskill.errors import InputError, TakenError
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.pools import open_pool
 from lerobot_constructskill.progress import Progress
@@ -53,7 +54,7 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
     Raises:
         ValueError: the folder holds another plan's results.
         FileExistsError: another process is running this study.
-        RuntimeError: a simulator's process died.
+        OSError: a simulator's process died.
     """
     with _claimed(root):
         _write_plan(plan, root)
@@ -107,14 +108,14 @@ def _claimed(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise FileExistsError(f"Another process is running the study in {root} at this moment.") from None
+            raise TakenError(f"Another process is running the study in {root} at this moment.") from None
         yield
 
 
 def _write_plan(plan: StudyPlan, root: Path) -> None:
     path = root / PLAN
     if path.exists() and decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
-        raise ValueError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
+        raise InputError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
     with replaced(path) as partial:
         partial.write_text(yaml.safe_dump(draccus.encode(plan), sort_keys=False))
 

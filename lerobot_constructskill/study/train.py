@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 
 from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import open_patches
 from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads, chunk_errors
@@ -40,7 +41,7 @@ def train_seeds(
     """
     template = make_policy(deepcopy(config), ds_meta=dataset.meta)
     if template.config.feature_column is None:
-        raise ValueError(
+        raise InputError(
             f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
             "constructskill-encode makes of a data set."
         )

@@ -14,7 +14,7 @@ import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.plan import StudyPlan
@@ -72,10 +72,10 @@ def read_study(root: Path) -> tuple[StudyPlan, pd.DataFrame]:
     plan, rows = root / "plan.yaml", root / "rows.parquet"
     for path in (plan, rows):
         if not path.is_file():
-            raise FileNotFoundError(f"'{root}' is no folder of a study: {path.name} is missing.")
+            raise MissingError(f"'{root}' is no folder of a study: {path.name} is missing.")
     try:
         decoded = decode(StudyPlan, yaml.safe_load(plan.read_text()))
-    except (ValueError, yaml.YAMLError) as error:
+    except (InputError, yaml.YAMLError) as error:
         raise InputError(f"'{plan}' is not a study's plan: {error}") from None
     return decoded, read_rows(rows)
 
