@@ -8,6 +8,8 @@ as privileged state.
 from dataclasses import dataclass
 from math import pi
 
+from lerobot_constructskill.errors import InputError
+
 FPS = 20
 """Control rate in Hz: ManiSkill's default, and the frame rate of every data set."""
 
@@ -217,7 +219,7 @@ def get_task(name: str) -> Task:
         ValueError: there is no such task; the message lists those there are.
     """
     if name not in TASKS:
-        raise ValueError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {', '.join(SUITES)}.")
+        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {', '.join(SUITES)}.")
     return TASKS[name]
 
 
@@ -247,9 +249,9 @@ def select_tasks(names: str) -> dict[str, list[Task]]:
         selected.setdefault(suite, []).extend(get_task(member) for member in members)
     rows = [row for suite in selected.values() for row in suite]
     if len(set(rows)) < len(rows):
-        raise ValueError(f"'{names}' names a task twice; name each once.")
+        raise InputError(f"'{names}' names a task twice; name each once.")
     if len({row.action_names for row in rows}) > 1:
-        raise ValueError(
+        raise InputError(
             f"'{names}' mixes tasks whose actions differ; choose tasks that share {rows[0].action_names}."
         )
     return selected

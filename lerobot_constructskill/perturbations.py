@@ -6,6 +6,8 @@ and a seed alone; what it draws every episode (initial pose, sensor noise) from 
 
 from dataclasses import dataclass
 
+from lerobot_constructskill.errors import InputError
+
 
 @dataclass(frozen=True)
 class Axis:
@@ -49,10 +51,10 @@ class Perturbation:
     def __post_init__(self):
         for name, level in self._pairs():
             if name not in AXES:
-                raise ValueError(f"Unknown perturbation '{name}'; the axes are: {', '.join(AXES)}.")
+                raise InputError(f"Unknown perturbation '{name}'; the axes are: {', '.join(AXES)}.")
             highest = len(AXES[name].levels)
             if not level.isdecimal() or int(level) > highest:
-                raise ValueError(f"The level of '{name}' must be 0 to {highest}, not '{level}'.")
+                raise InputError(f"The level of '{name}' must be 0 to {highest}, not '{level}'.")
 
     def _pairs(self) -> list[tuple[str, str]]:
         parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]

@@ -8,6 +8,8 @@ from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 
+from lerobot_constructskill.errors import InputError, MachineError
+
 type Submit = Callable[..., Future]
 
 
@@ -45,7 +47,7 @@ def _processes(workers: int) -> Iterator[Submit]:
         with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_settle) as pool:
             yield pool.submit
     except BrokenExecutor:
-        raise OSError(
+        raise MachineError(
             "A worker process died, for want of memory perhaps; the same command continues with what is finished."
         ) from None
 
@@ -69,7 +71,7 @@ def _ray(workers: int) -> Iterator[Submit]:
     try:
         import ray
     except ImportError:
-        raise ValueError("Ray is not installed; pip install 'lerobot_env_constructskill[distributed]'.") from None
+        raise InputError("Ray is not installed; pip install 'lerobot_env_constructskill[distributed]'.") from None
     here = {} if "RAY_ADDRESS" in os.environ else {"num_cpus": workers, "include_dashboard": False}
     ray.init(log_to_driver=False, logging_level="error", **here)
     try:

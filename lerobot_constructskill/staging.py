@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from lerobot_constructskill.errors import TakenError
+
 MARK = ".constructskill"
 """File that tells our working folders from a user's, and that the process at work holds locked."""
 
@@ -25,17 +27,17 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
         FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
     """
     if root.exists():
-        raise FileExistsError(f"The output folder {root} exists already; remove it or name another.")
+        raise TakenError(f"The output folder {root} exists already; remove it or name another.")
     partial = root.with_name(root.name + ".partial")
     mark = partial / MARK
     if partial.exists() and not mark.exists():
-        raise FileExistsError(f"{partial} is in the way and not from an interrupted run; move it away.")
+        raise TakenError(f"{partial} is in the way and not from an interrupted run; move it away.")
     partial.mkdir(parents=True, exist_ok=True)
     with mark.open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise FileExistsError(f"Another process is writing {root} at this moment.") from None
+            raise TakenError(f"Another process is writing {root} at this moment.") from None
         folder = partial / "dataset"
         try:
             shutil.rmtree(folder, ignore_errors=True)

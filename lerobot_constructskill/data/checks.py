@@ -26,6 +26,7 @@ from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.modality import MODALITY
 from lerobot_constructskill.demos.noise import execute
 from lerobot_constructskill.demos.settings import PACKAGES
+from lerobot_constructskill.errors import UserError
 
 type Check = Callable[[DataSet], Iterator[str]]
 
@@ -248,11 +249,16 @@ CHECKS: dict[str, Check] = {
 
 
 def complaints(data: DataSet, check: Check) -> list[str]:
-    """What `check` finds wrong, the first few things; also where it cannot look because something is not there."""
+    """What `check` finds wrong, the first few things; also where it cannot look because something is not there.
+
+    A check may rely on the schema. Where that is right, what a check itself raises is an error of the check.
+    """
     try:
         found = list(check(data))
-    except (KeyError, IndexError) as error:
-        return [f"Cannot be checked: {error} is missing."]
-    except ValueError as error:
+    except UserError as error:
         return [f"Cannot be checked: {error}"]
+    except Exception:
+        if check is check_schema or not complaints(data, check_schema):
+            raise
+        return ["Cannot be checked while the schema is wrong."]
     return found[:3] + [f"And {len(found) - 3} more like these."] * (len(found) > 3)

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,28 @@ import pandas as pd
 
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.parsing import decode
+
+EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
+VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
+"""What LeRobot's episode tables say of every episode, and of its part of every video."""
+
+
+class Facts(dict):
+    """A JSON object of a data set; what it lacks is no error of those who ask for it.
+
+    Args:
+        file: the file that it is from.
+        fields: its names and values.
+    """
+
+    def __init__(self, file: str, fields: dict[str, Any]):
+        super().__init__(fields)
+        self.file = file
+
+    def __missing__(self, name: str):
+        raise InputError(f"{self.file} has no '{name}'.")
 
 
 @dataclass(frozen=True)
@@ -28,24 +50,31 @@ class DataSet:
     """
 
     root: Path
-    info: dict[str, Any]
-    stats: dict[str, Any]
-    facts: dict[str, Any]
+    info: Facts
+    stats: Facts
+    facts: Facts
     rows: pd.DataFrame
     episodes: pd.DataFrame
     tasks: list[str]
 
     def column(self, name: str) -> np.ndarray:
-        """A column as (N, ...) array; (N,) where a frame holds one value."""
-        values = self.rows[name]
-        return np.stack(values) if values.dtype == object and len(np.shape(values.iloc[0])) else values.to_numpy()
+        """A column as (N, ...) array; (N,) where a frame holds one value.
+
+        Raises:
+            InputError: the frames have no such column, or its values are not of the shape that info.json tells.
+        """
+        if name not in self.rows:
+            raise InputError(f"data/ has no column {name}.")
+        values, wanted = self.rows[name], tuple(self.info["features"][name]["shape"])
+        wrong = {np.shape(value) or (1,) for value in values} - {wanted}
+        if wrong:
+            raise InputError(f"{name} has values of shape {wrong.pop()}, not {wanted} as info.json says.")
+        return np.stack(values) if len(np.shape(values.iloc[0])) else values.to_numpy()
 
     @cached_property
     def config(self) -> GenerateConfig:
         """The settings it was generated with."""
-        import draccus
-
-        return draccus.decode(GenerateConfig, self.facts["generator"])
+        return decode(GenerateConfig, self.facts["generator"])
 
     @property
     def cameras(self) -> list[str]:
@@ -67,12 +96,12 @@ def open_dataset(root: Path) -> DataSet:
 
     Raises:
         FileNotFoundError: there is no data set at `root`.
-        ValueError: a file that cannot be read; the message names it.
+        ValueError: a file that cannot be read, or that lacks what every data set has; the message names it.
     """
     if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(f"There is no data set in {root}: meta/info.json is missing.")
+        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
     tasks = _tables(root, "meta/tasks.parquet").reset_index()
-    return DataSet(
+    data = DataSet(
         root=root,
         info=_json(root, "meta/info.json"),
         stats=_json(root, "meta/stats.json"),
@@ -81,23 +110,30 @@ def open_dataset(root: Path) -> DataSet:
         episodes=_tables(root, "meta/episodes/*/*.parquet"),
         tasks=tasks.sort_values("task_index").iloc[:, 0].tolist(),
     )
+    if data.rows.empty:
+        raise InputError("data/ holds no frames.")
+    of_videos = [f"videos/{camera}/{name}" for camera in data.cameras for name in VIDEO_COLUMNS]
+    missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
+    if missing:
+        raise InputError(f"meta/episodes/ has no column {missing[0]}.")
+    return data
 
 
-def _json(root: Path, name: str) -> dict[str, Any]:
+def _json(root: Path, name: str) -> Facts:
     try:
-        return json.loads((root / name).read_text())
+        return json.loads((root / name).read_text(), object_hook=partial(Facts, name))
     except (OSError, ValueError) as error:
-        raise ValueError(f"{name} cannot be read ({error}).") from None
+        raise InputError(f"{name} cannot be read ({error}).") from None
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:
     paths = sorted(root.glob(pattern))
     if not paths:
-        raise ValueError(f"{pattern} cannot be read (there is no such file).")
+        raise InputError(f"{pattern} cannot be read (there is no such file).")
     tables = []
     for path in paths:
         try:
             tables.append(pd.read_parquet(path))
         except (OSError, ValueError) as error:
-            raise ValueError(f"{path.relative_to(root)} cannot be read ({error}).") from None
+            raise InputError(f"{path.relative_to(root)} cannot be read ({error}).") from None
     return pd.concat(tables, ignore_index=len(paths) > 1)

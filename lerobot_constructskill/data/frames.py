@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.data.dataset import DataSet
+from lerobot_constructskill.errors import InputError
 
 FLAT = 2.0
 """Standard deviation over a picture, of 255, below which nothing is seen on it."""
@@ -90,7 +91,7 @@ def pictures(data: DataSet, camera: str) -> Iterator[tuple[int, np.ndarray]]:
                     yield row, frame.to_ndarray(format="rgb24")
                     row += 1
         except (av.FFmpegError, IndexError) as error:
-            raise ValueError(f"{path.relative_to(data.root)} cannot be decoded ({error}).") from None
+            raise InputError(f"{path.relative_to(data.root)} cannot be decoded ({error}).") from None
 
 
 FRAME_CHECKS = {"Videos": check_videos, "Pictures": check_pictures}

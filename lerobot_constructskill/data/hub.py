@@ -3,6 +3,12 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
@@ -18,10 +24,10 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
 
     if root is not None:
         if not root.is_dir():
-            raise FileNotFoundError(f"There is no folder {root}.")
+            raise MissingError(f"There is no folder {root}.")
         return root
     if repo_id is None:
-        raise ValueError("Name a data set with --repo_id, or its folder with --root.")
+        raise InputError("Name a data set with --repo_id, or its folder with --root.")
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
     return pull(repo_id, revision)
@@ -43,19 +49,39 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
     return Path(folder)
 
 
+def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
+    """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
+
+    Raises:
+        FileNotFoundError: there is no data set in `root`.
+        ValueError: a file of it cannot be read.
+        OSError: the Hub does not have it, or cannot be reached.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    if root is not None and not (root / "meta" / "info.json").is_file():
+        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
+    try:
+        with one_sentence(repo_id, revision):
+            return LeRobotDataset(repo_id, root=root, revision=revision)
+    except (ValueError, LookupError) as error:
+        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({error}).") from error
+
+
 @contextmanager
 def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
     import httpx
+    from huggingface_hub.errors import HFValidationError
 
     try:
         yield
-    except (OSError, RuntimeError, httpx.HTTPError) as error:
+    except (OSError, RuntimeError, HFValidationError, httpx.HTTPError) as error:
         # An upload's own error is the cause of a bare RuntimeError.
         reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
         if reason is None:
             raise
-        raise OSError(reason) from None
+        raise MachineError(reason) from None
 
 
 def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
@@ -72,6 +98,10 @@ def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> 
         return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
     if isinstance(error, errors.HfHubHTTPError):
         return _refusal(repo_id, error.response.status_code)
+    if isinstance(error, errors.HFValidationError):
+        return f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."
+    if isinstance(error, httpx.ConnectError):
+        return f"The Hub cannot be reached for '{repo_id}'."
     if isinstance(error, httpx.HTTPError):
         return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
     return None
@@ -107,7 +137,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         api.create_repo(**repo, private=private, exist_ok=True)
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
         if CODEBASE_VERSION in tagged and not update:
-            raise FileExistsError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
+            raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
         commit = api.upload_folder(**repo, folder_path=root, ignore_patterns=[".cache/*"], delete_patterns=stale)
         for name in filter(None, (CODEBASE_VERSION, tag)):

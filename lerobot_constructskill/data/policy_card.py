@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
+from lerobot_constructskill.errors import MissingError
 
 
 def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
@@ -21,7 +22,7 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
         outcomes.append((int(path.parent.name.removeprefix("seed_")), lifted, placed, len(stages)))
     if not outcomes:
-        raise FileNotFoundError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
+        raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
     return sorted(outcomes)
 
 

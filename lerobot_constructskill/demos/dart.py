@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.pretrained import PreTrainedPolicy
-from tqdm import tqdm
+
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.progress import Progress
 
 
 def policy_errors(
@@ -29,7 +31,7 @@ def policy_errors(
     policy.reset()
     row = dataset.meta.episodes[episode]
     errors = []
-    for index in tqdm(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}", leave=False):
+    for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
         frame = dataset[index]
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         with torch.inference_mode():
@@ -60,9 +62,9 @@ def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.n
     """
     errors = [error for error in errors if len(error)]
     if not errors:
-        raise ValueError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
+        raise InputError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
     if alpha is not None and not alpha > 0:
-        raise ValueError(f"alpha must be above 0 m2, not {alpha}.")
+        raise InputError(f"alpha must be above 0 m2, not {alpha}.")
     covariance = np.mean([error.T @ error / len(error) for error in errors], axis=0)
     if alpha is None:
         return covariance

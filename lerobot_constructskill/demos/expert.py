@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from lerobot_constructskill.contract import Task
+from lerobot_constructskill.errors import InputError
 
 
 class Phase(StrEnum):
@@ -102,10 +103,10 @@ class ExpertConfig:
     def __post_init__(self):
         for name in ("gain", "max_step", "load_max_step", "threshold", "align_tolerance"):
             if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"The expert's {name} must be above 0, not {getattr(self, name)}.")
+                raise InputError(f"The expert's {name} must be above 0, not {getattr(self, name)}.")
         for name in ("grasp_dwell", "release_dwell"):
             if getattr(self, name) < 1:
-                raise ValueError(f"The expert's {name} must be at least 1 step, not {getattr(self, name)}.")
+                raise InputError(f"The expert's {name} must be at least 1 step, not {getattr(self, name)}.")
 
 
 class Expert(Protocol):

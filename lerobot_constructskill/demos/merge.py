@@ -14,6 +14,7 @@ from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import MODALITY, modality
 from lerobot_constructskill.demos.settings import GenerateConfig, package_versions, provenance
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
+from lerobot_constructskill.errors import InputError
 
 GROUP = 32
 """Data sets that are aggregated at a time."""
@@ -26,7 +27,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         ValueError: the attempts were drawn in different ways, on machines that are not alike.
     """
     if len({attempt.light_robot for attempt in attempts}) > 1:
-        raise ValueError(
+        raise InputError(
             "Some attempts drew the light robot and some the full one, on machines with and without a GPU: "
             "set --light_robot and generate anew."
         )

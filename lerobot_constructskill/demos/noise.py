@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lerobot_constructskill.demos.expert import Phase
+from lerobot_constructskill.errors import InputError
 
 MODELS = ("none", "fixed", "isotropic", "dart")
 FITTED = ("isotropic", "dart")
@@ -36,16 +37,16 @@ class NoiseConfig:
 
     def __post_init__(self):
         if self.model not in MODELS:
-            raise ValueError(f"Unknown noise model '{self.model}'; choose one of: {', '.join(MODELS)}.")
+            raise InputError(f"Unknown noise model '{self.model}'; choose one of: {', '.join(MODELS)}.")
         if not 0 <= self.sigma < np.inf:
-            raise ValueError(f"Noise sigma must be 0 or more metres, not {self.sigma}.")
+            raise InputError(f"Noise sigma must be 0 or more metres, not {self.sigma}.")
         if not self.clip > 0:
-            raise ValueError(f"Noise clip must be above 0 metres, not {self.clip}.")
+            raise InputError(f"Noise clip must be above 0 metres, not {self.clip}.")
         unknown = [phase for phase in self.phases if phase not in list(Phase)]
         if unknown:
-            raise ValueError(f"Unknown phase {unknown[0]!r}; the phases are: {', '.join(Phase)}.")
+            raise InputError(f"Unknown phase {unknown[0]!r}; the phases are: {', '.join(Phase)}.")
         if self.model in FITTED and self.covariance is None:
-            raise ValueError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
+            raise InputError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
         if self.covariance is not None:
             _check_covariance(self.covariance)
 
@@ -66,9 +67,9 @@ class NoiseConfig:
 def _check_covariance(covariance: list[list[float]]) -> None:
     matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, atol=1e-12):
-        raise ValueError(f"A noise covariance is a symmetric 3 x 3 matrix in m2, not {covariance}.")
+        raise InputError(f"A noise covariance is a symmetric 3 x 3 matrix in m2, not {covariance}.")
     if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
-        raise ValueError(f"The noise covariance {covariance} has a negative variance.")
+        raise InputError(f"The noise covariance {covariance} has a negative variance.")
 
 
 def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray:

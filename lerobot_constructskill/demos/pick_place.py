@@ -88,7 +88,7 @@ class PickPlaceExpert:
                 return _within_reach(progress.anchor + [0, 0, self.config.lift_height])
             case Phase.CARRY:
                 return self._release_point(state)
-        raise ValueError(f"{progress.phase} has no target.")
+        raise RuntimeError(f"{progress.phase} has no target.")
 
     def _grasp_point(self, state: PrivilegedState) -> np.ndarray:
         return state.object_pose[:3] + [0, 0, state.object_size[2] / 2 - self.config.finger_depth]

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from tqdm import tqdm
-
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
+from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.pools import open_pool
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.staging import staged
 
 SHARDS = "shards"
@@ -53,7 +53,8 @@ def record(config: GenerateConfig) -> Summary:
     with staged(root, keep=SHARDS) as folder:
         shards = folder.with_name(SHARDS) / frames_digest(config)
         attempts = _run_attempts(config, shards)
-        merge(config, attempts, shards, folder)
+        with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
+            merge(config, attempts, shards, folder)
     lengths = [outcome.frames for outcome in attempts if outcome.success]
     return Summary(root, len(lengths), sum(lengths), [outcome.seed for outcome in attempts if not outcome.success])
 
@@ -65,12 +66,14 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
     """
     before, attempts, running = finished(shards), [], set()
     seeds = count(config.seed_start)
-    bar = tqdm(total=config.episodes, desc="demonstrations", unit="demo")
+    found = min(config.episodes, sum(outcome.success for outcome in before.values()))
+    # Smoothed: the start of the simulators, in the first demonstration's time, is forgotten by and by.
+    bar = Progress(total=config.episodes, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
     with bar, open_pool(config.executor, config.workers) as submit:
         while True:
             successes = sum(outcome.success for outcome in attempts)
             bar.set_postfix(discarded=len(attempts) - successes, refresh=False)
-            bar.update(successes - bar.n)
+            bar.update(max(0, successes - bar.n))
             _check_failures(config, len(attempts) - successes)
             if len(running) < min(config.episodes - successes, config.workers):
                 seed = next(seeds)
@@ -87,7 +90,7 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
 
 def _check_failures(config: GenerateConfig, failures: int) -> None:
     if failures > config.max_failures * config.episodes:
-        raise ValueError(
+        raise InputError(
             f"{failures} attempts failed, more than max_failures={config.max_failures} allows for "
             f"{config.episodes} demonstrations: check the expert's and the noise's values."
         )
@@ -100,7 +103,7 @@ def _check_disk(config: GenerateConfig, root: Path) -> None:
     disk = next(folder for folder in root.absolute().parents if folder.exists())
     free = shutil.disk_usage(disk).free
     if free < needed:
-        raise OSError(
+        raise MachineError(
             f"{disk} has {free / 1e6:,.0f} MB free and {config.episodes} episodes of up to {config.max_steps} steps "
             f"take up to {needed / 1e6:,.0f} MB: make room, name another root, or ask for fewer."
         )

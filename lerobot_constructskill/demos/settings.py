@@ -9,6 +9,7 @@ from typing import Any
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed")
 EXECUTORS = ("processes", "ray")
@@ -62,10 +63,10 @@ class GenerateConfig:
         get_task(self.task)
         for name, choices in (("obs_type", OBS_TYPES), ("labels", LABELS), ("executor", EXECUTORS)):
             if getattr(self, name) not in choices:
-                raise ValueError(f"Unknown {name} '{getattr(self, name)}'; choose one of: {', '.join(choices)}.")
+                raise InputError(f"Unknown {name} '{getattr(self, name)}'; choose one of: {', '.join(choices)}.")
         for name in ("episodes", "max_steps", "workers"):
             if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}.")
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
 
 
 def provenance(config: GenerateConfig) -> dict[str, Any]:

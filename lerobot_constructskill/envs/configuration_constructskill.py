@@ -13,6 +13,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
@@ -51,14 +52,14 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     def __post_init__(self):
         if self.max_parallel_tasks != 1:
-            raise ValueError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+            raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
         if self.fps != FPS:
-            raise ValueError(f"fps must be {FPS}, the control rate of every task, not {self.fps}.")
+            raise InputError(f"fps must be {FPS}, the control rate of every task, not {self.fps}.")
         if self.vectorization not in VECTORIZATIONS:
             choices = " or ".join(VECTORIZATIONS)
-            raise ValueError(f"vectorization must be {choices}, not '{self.vectorization}'.")
+            raise InputError(f"vectorization must be {choices}, not '{self.vectorization}'.")
         if self.vectorization == "native" and self.perturb:
-            raise ValueError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
+            raise InputError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
         rows = [row for suite in select_tasks(self.task).values() for row in suite]
         for row in rows:
             self._make_env(row.name)  # refuses what no environment can be made with

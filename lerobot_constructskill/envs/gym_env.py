@@ -20,6 +20,7 @@ from lerobot_constructskill.contract import (
     TRANSLATION,
     get_task,
 )
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
 
 CHANNEL_SCALE = {
@@ -78,13 +79,13 @@ class ConstructSkillEnv(gym.Env):
         self._perturbation = Perturbation(perturb, perturb_seed)
         self._row = get_task(task)
         if obs_type not in OBS_TYPES:
-            raise ValueError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
+            raise InputError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
         if render_backend not in RENDER_BACKENDS:
-            raise ValueError(
+            raise InputError(
                 f"Unknown render_backend '{render_backend}'; choose one of: {', '.join(RENDER_BACKENDS)}."
             )
         if episode_length is not None and episode_length < 1:
-            raise ValueError(f"episode_length must be at least 1 step, not {episode_length}.")
+            raise InputError(f"episode_length must be at least 1 step, not {episode_length}.")
         self.task = task
         self.task_description = self._row.instruction
         self.obs_type = obs_type
@@ -202,7 +203,7 @@ class ConstructSkillEnv(gym.Env):
         action = np.asarray(action, dtype=np.float32)
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():
-            raise ValueError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
+            raise InputError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
         scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
         for name, value in zip(names, action, strict=True):
             scaled[MANISKILL_CHANNELS.index(name)] = value / CHANNEL_SCALE[name]

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import MachineError
 
 
 class NativeVectorEnv(gym.vector.VectorEnv):
@@ -104,7 +105,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         except RuntimeError as error:
             if "cuda" not in str(error):
                 raise
-            raise OSError(
+            raise MachineError(
                 f"{self.num_envs} environments in one simulator need a GPU, and there is none ({error}); use one, or "
                 "--env.vectorization=process."
             ) from None

@@ -18,6 +18,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
@@ -47,7 +48,7 @@ def load_encoder(
     """
     spec = get_backbone(backbone)
     if precision not in (AUTO, *PRECISIONS):
-        raise ValueError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{precision}'.")
+        raise InputError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{precision}'.")
     precision = resolve_precision(precision, device)
     check_native(precision, device)
     state, source = load_weights(spec, path)
@@ -97,7 +98,7 @@ def _encode_frames(
     key = f"observation.images.{camera}"
     if key not in dataset.meta.camera_keys:
         cameras = ", ".join(dataset.meta.camera_keys) or "none"
-        raise ValueError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
+        raise InputError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
     missing = [episode for episode in dataset.meta.episodes if not _part(parts, episode).exists()]
     finished = dataset.num_frames - sum(episode["length"] for episode in missing)
     # Frames of an earlier run are where the bar starts, not part of its rate.

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -25,15 +26,17 @@ def check(config: CheckConfig) -> str:
     from lerobot_constructskill.data.checks import CHECKS, complaints
     from lerobot_constructskill.data.dataset import open_dataset
     from lerobot_constructskill.data.hub import locate
+    from lerobot_constructskill.progress import Progress
 
     data = open_dataset(locate(config.repo_id, config.root, config.revision))
     wrong = 0
-    for name, one in CHECKS.items():
+    for name, one in Progress(CHECKS.items(), "check", unit="check", leave=False):
         found = complaints(data, one)
         wrong += bool(found)
-        print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
+        with Progress.external_write_mode():
+            print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
     if wrong:
-        raise ValueError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
+        raise InputError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
     return f"{len(data.episodes)} demonstrations, {len(data.rows)} frames: {len(CHECKS)} checks, nothing wrong."
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 TILE = 224
@@ -35,7 +36,7 @@ class CheckConfig:
     def __post_init__(self):
         get_task(self.task)
         if self.states < 1:
-            raise ValueError(f"states must be at least 1, not {self.states}.")
+            raise InputError(f"states must be at least 1, not {self.states}.")
 
 
 def check(config: CheckConfig) -> str:
@@ -51,24 +52,23 @@ def check(config: CheckConfig) -> str:
         f"{get_task(config.task).horizon} steps. Look at {sheet}."
     )
     if len(failures) > (1 - REQUIRED) * config.states:
-        raise ValueError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
+        raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
     if config.tests and (code := run_tests(config.task)):
-        raise ValueError(f"{report} Its tests failed with status {code}; pytest tells why above.")
+        raise InputError(f"{report} Its tests failed with status {code}; pytest tells why above.")
     return report
 
 
 def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
     """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
-    from tqdm import trange
-
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.progress import Progress
 
     env = ConstructSkillEnv(config.task, render_backend="none")
     expert = make_expert(get_task(config.task), config.expert)
     lengths, failures = [], []
-    for seed in trange(DEMO_SEED_START, DEMO_SEED_START + config.states, desc=config.task, unit="state"):
+    for seed in Progress(range(DEMO_SEED_START, DEMO_SEED_START + config.states), "expert", unit="state"):
         frames, success = demonstrate(env, expert, config.noise, seed)
         if success:
             lengths.append(len(frames))
@@ -86,16 +86,19 @@ def save_contact_sheet(config: CheckConfig) -> Path:
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.progress import Progress
 
     env = ConstructSkillEnv(config.task)
     expert = make_expert(get_task(config.task), config.expert)
     columns = {}
 
     def keep(phase, obs):
+        bar.update()
         if phase not in columns:
             columns[phase] = (obs["pixels"]["base"], env.render())
 
-    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
+    with Progress(desc="contact sheet", unit="step") as bar:
+        demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"

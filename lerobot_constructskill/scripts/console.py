@@ -1,33 +1,87 @@
-"""What the console commands share: a configuration from flags and YAML, and errors as one sentence."""
+"""The edge of the console commands: a configuration from flags and YAML, and whatever goes wrong as one sentence."""
 
+import logging
+import os
+import shlex
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 
-import draccus
+from lerobot_constructskill.errors import UserError, full_traceback
+
+REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
+"""Exit statuses: the user's to mend; a defect of ours; Ctrl-C."""
+
+DEBUG = "--debug"
+EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
 
 
 def run[Config](config_class: type[Config], action: Callable[[Config], str]) -> None:
-    """Parse `config_class` from the command line and print what `action` returns; exit with 1 if it refuses.
+    """Parse `config_class` from the command line and print what `action` returns, inside `edge`."""
+    with edge():
+        from lerobot_constructskill.parsing import parse
 
-    A `ValueError` or `OSError` is the user's to read and is printed without a traceback; any other exception is a
-    defect and keeps it.
-    """
+        print(action(parse(config_class, epilog=EPILOG)))
+
+
+@contextmanager
+def edge() -> Iterator[None]:
+    """Turn what a command raises into one sentence and an exit status, and keep its traceback in a log."""
+    command, debug = list(sys.argv), DEBUG in sys.argv
+    sys.argv = [argument for argument in sys.argv if argument != DEBUG]
+    logging.getLogger().addFilter(_is_news)
     try:
-        print(action(_parse(config_class)))
-    except (ValueError, OSError) as error:
-        sys.exit(f"{Path(sys.argv[0]).stem}: {' '.join(str(error).split())}")
-    except KeyboardInterrupt:
-        sys.exit(130)
+        yield
+    except (Exception, KeyboardInterrupt) as error:
+        sys.exit(_report(error, command, debug))
 
 
-def _parse[Config](config_class: type[Config]) -> Config:
+def _is_news(record: logging.LogRecord) -> bool:
+    """LeRobot warns at every policy that there is no GPU, as most of our users know of their machine."""
+    return not record.getMessage().startswith("No accelerated backend detected")
+
+
+def _report(error: BaseException, command: list[str], debug: bool) -> int:
+    """Tell the user, keep the traceback, and return the exit status."""
+    name, told = Path(command[0]).stem, full_traceback(error)
+    log = _keep(name, f"{datetime.now():%Y-%m-%d %H:%M:%S}  {shlex.join(command)}\n{told}\n")
+    if debug or log is None:
+        print(told, file=sys.stderr)
+    status, sentence = _judge(error)
+    if status == FAULT:
+        sentence += f"; the traceback is {'above' if log is None else f'in {log}'}"
+    print(f"{name}: {sentence}", file=sys.stderr)
+    return status
+
+
+def _judge(error: BaseException) -> tuple[int, str]:
+    said = " ".join(str(error).split())
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED, "interrupted"
+    if isinstance(error, UserError | OSError):
+        return REFUSED, said
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lerobot_constructskill"):
+        return REFUSED, f"{said}; constructskill-doctor tells what is not installed"
+    return FAULT, f"this is a fault of ours, not of your input: {type(error).__name__}: {said}"
+
+
+def _keep(name: str, entry: str) -> Path | None:
+    """Add to a command's log, or where the home folder cannot be written to a new one; None if that fails as well."""
     try:
-        return draccus.parse(config_class)
-    except draccus.ParsingError as error:
-        cause = error
-        while cause.__cause__ is not None:
-            cause = cause.__cause__
-        raise ValueError(str(cause)) from None
-    except TypeError:  # draccus merges the file's fields with the flags before it looks at them
-        raise ValueError("The file of --config_path is empty or not a mapping of fields.") from None
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "constructskill"
+        folder.mkdir(parents=True, exist_ok=True)
+        log = folder / f"{name}.log"
+        with log.open("a") as file:
+            file.write(entry)
+        return log
+    except (OSError, RuntimeError):  # Path.home raises the latter for a user who has none
+        pass
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix=f"{name}-", suffix=".log", delete=False) as file:
+            file.write(entry)
+        return Path(file.name)
+    except OSError:
+        return None

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterable
 from importlib import metadata
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.checks import (
     DISTRIBUTION,
     Finding,
@@ -22,6 +23,7 @@ from lerobot_constructskill.scripts.checks import (
     judge_vulkan,
     judge_weights,
 )
+from lerobot_constructskill.scripts.console import EPILOG, edge
 
 PROBE_TIMEOUT_S = 180
 
@@ -125,15 +127,19 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
     return int(failed > 0)
 
 
-def main() -> int:
+def main() -> None:
     parser = argparse.ArgumentParser(
         prog="constructskill-doctor",
         description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin and the pretrained weights "
         "of this machine (about a minute). Exit status 1 where something fails.",
+        epilog=EPILOG,
     )
-    parser.parse_args()
-    return diagnose()
+    with edge():
+        _, unknown = parser.parse_known_args()
+        if unknown:
+            raise InputError(f"unrecognized arguments: {' '.join(unknown)}")
+        sys.exit(diagnose())
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.staging import staged
 
@@ -38,14 +39,14 @@ def encode(config: EncodeConfig) -> Path:
         FileNotFoundError: the data set or the backbone's weights cannot be had.
         OSError: the output folder cannot be written, which shows before anything is encoded.
     """
-    from lerobot.datasets import LeRobotDataset
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
+    from lerobot_constructskill.data.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
     if config.batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1, got {config.batch_size}.")
+        raise InputError(f"batch_size must be at least 1, got {config.batch_size}.")
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:
@@ -53,7 +54,7 @@ def encode(config: EncodeConfig) -> Path:
         encoder, info = load_encoder(
             config.backbone, config.backbone_path, config.backbone_precision, config.crop, device
         )
-        dataset = LeRobotDataset(config.repo_id, root=config.root)
+        dataset = open_lerobot(config.repo_id, config.root)
         write_feature_set(
             dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches
         )

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -31,21 +32,24 @@ def fit_noise(config: FitNoiseConfig) -> str:
     """
     import numpy as np
     import yaml
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils.device_utils import auto_select_torch_device
 
     import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.data.hub import one_sentence, open_lerobot
     from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
+    from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.study.agents import PolicyAgent
 
-    dataset = LeRobotDataset(config.repo_id, root=config.root)
+    dataset = open_lerobot(config.repo_id, config.root)
     generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
     episodes = config.episodes or held_out(dataset.num_episodes)
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
-        raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
-    agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
+        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+    with one_sentence(config.policy_path):
+        agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
-    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in episodes]
+    bar = Progress(episodes, "demonstrations", unit="demo")
+    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,

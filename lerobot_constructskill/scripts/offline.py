@@ -7,6 +7,7 @@ from glob import glob
 from pathlib import Path
 
 from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.hashing import data_sha256, file_sha256
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.staging import replaced
@@ -46,20 +47,22 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
-    from lerobot.datasets import LeRobotDataset
+    from lerobot_constructskill.data.hub import open_lerobot
+    from lerobot_constructskill.progress import Progress
 
     checkpoints = _find(config.policies)
-    dataset = LeRobotDataset(config.repo_id, root=config.root, revision=config.revision)
+    dataset = open_lerobot(config.repo_id, config.root, config.revision)
     episodes = held_out(dataset.num_episodes) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
-        raise ValueError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
     source = {
         "episodes": ",".join(map(str, episodes)),
         "dataset": config.repo_id,
         "dataset_revision": dataset.revision if config.root is None else None,
         "dataset_sha256": data_sha256(dataset.root),
     }
-    rows = [_row(path, dataset, episodes, config) | source for path in checkpoints]
+    bar = Progress(checkpoints, "policies", unit="policy")
+    rows = [_row(path, dataset, episodes, config) | source for path in bar]
     return _write(rows, config.out)
 
 
@@ -69,7 +72,7 @@ def _find(patterns: list[str]) -> list[Path]:
     for pattern in patterns:
         folders = [Path(name) for name in sorted(glob(pattern)) if (Path(name) / "config.json").is_file()]
         if not folders:
-            raise FileNotFoundError(f"'{pattern}' matches no checkpoint's pretrained_model folder.")
+            raise MissingError(f"'{pattern}' matches no checkpoint's pretrained_model folder.")
         found += folders
     return found
 

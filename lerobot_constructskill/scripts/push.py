@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -32,12 +33,14 @@ def push_dataset(config: PushConfig) -> str:
     from lerobot_constructskill.data.checks import CHECKS, complaints
     from lerobot_constructskill.data.dataset import open_dataset
     from lerobot_constructskill.data.hub import push
+    from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.scripts.card import CardConfig, write_card
 
     data = open_dataset(config.root)
-    wrong = [f"{name}: {complaint}" for name, check in CHECKS.items() for complaint in complaints(data, check)]
+    checks = Progress(CHECKS.items(), "check", unit="check")
+    wrong = [f"{name}: {complaint}" for name, check in checks for complaint in complaints(data, check)]
     if wrong:
-        raise ValueError(f"{config.root} is not pushed, because of {len(wrong)} complaints; {wrong[0]}")
+        raise InputError(f"{config.root} is not pushed, because of {len(wrong)} complaints; {wrong[0]}")
     if not (config.root / "README.md").is_file():
         print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"

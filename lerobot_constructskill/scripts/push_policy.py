@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -41,7 +42,7 @@ def push_policy(config: PushPolicyConfig) -> str:
 
 def _read(path: Path) -> dict:
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing: name a checkpoint's pretrained_model folder.")
+        raise MissingError(f"{path} is missing: name a checkpoint's pretrained_model folder.")
     return json.loads(path.read_text())
 
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 
@@ -24,26 +25,25 @@ def replay_all(config: ReplayConfig) -> str:
         ValueError: no such episode, or outcomes that differ.
         OSError: this machine cannot render.
     """
-    from tqdm import tqdm
-
     from lerobot_constructskill.data.dataset import open_dataset
     from lerobot_constructskill.data.hub import locate
     from lerobot_constructskill.data.replay import replay
     from lerobot_constructskill.demos.expert import Phase
+    from lerobot_constructskill.progress import Progress
 
     data = open_dataset(locate(config.repo_id, config.root, config.revision))
     everything = range(len(data.episodes))
     episodes = list(everything) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(everything):
-        raise ValueError(f"Name episodes among the {len(everything)} there are, not {episodes}.")
+        raise InputError(f"Name episodes among the {len(everything)} there are, not {episodes}.")
     added, phases = 1000 * data.column("dart.noise"), data.column("phase")
     for phase in Phase:
         noise = added[phases == phase]
         print(f"{phase:<9} {len(noise):6} frames, added mean {noise.mean(0).round(2)} std {noise.std(0).round(2)} mm")
-    replays = {episode: replay(data, episode) for episode in tqdm(episodes, "replay", unit="demo")}
+    replays = {episode: replay(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:
-        raise ValueError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")
+        raise InputError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")
     deviation = max(one.deviation for one in replays.values())
     return f"{len(replays)} demonstrations ended as recorded; no state is further than {deviation:.2g} from its own."
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.study.plan import StudyPlan
 
@@ -57,8 +58,10 @@ def study(config: StudyConfig) -> str:
     rows = run_study(config.plan, root.absolute(), Store(config.data_root.absolute(), config.workers), options)
     runs = rows.groupby(["setting", "variant", "training_seed"])["error"].first()
     if runs.notna().all():
-        raise ValueError(f"All {len(runs)} runs failed, as their rows in {root} say; the first: {runs.iloc[0]}")
-    return f"{len(runs)} runs, {runs.notna().sum()} of them failed: {root} (next: constructskill-report --root={root})"
+        why = f"their tracebacks are in {root / 'logs'}; the first: {runs.iloc[0]}"
+        raise InputError(f"All {len(runs)} runs failed; {why}")
+    failed = f", {runs.notna().sum()} of them failed (why: {root / 'logs'})" if runs.notna().any() else ""
+    return f"{len(runs)} runs{failed}: {root} (next: constructskill-report --root={root})"
 
 
 def main() -> None:

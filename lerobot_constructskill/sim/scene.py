@@ -27,6 +27,7 @@ from lerobot_constructskill.contract import (
     ROBOT_BASE,
     Camera,
 )
+from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.perturb import Draws
@@ -129,7 +130,7 @@ class PickPlaceEnv(BaseEnv):
         self.draws = Draws(perturbation or Perturbation())
         if self.draws.perturbation.amount("size"):
             if not self.is_brick:
-                raise ValueError("The axis 'size' is EN 771-1's tolerance of bricks; this task has none.")
+                raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has none.")
             self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
@@ -148,7 +149,7 @@ class PickPlaceEnv(BaseEnv):
         except RuntimeError as error:
             if not any(word in str(error).lower() for word in NO_DEVICE):
                 raise
-            raise OSError(
+            raise MachineError(
                 f"No Vulkan device to render with ({error}); `make setup` installs Mesa's software renderer and "
                 "`constructskill-doctor` tells what is missing."
             ) from None

@@ -17,6 +17,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import Panda
 from PIL import Image
 
+from lerobot_constructskill.errors import MachineError
+
 LIGHT_TRIANGLES = 4_000
 """Triangles of the whole light robot; at 224 x 224 pixels the mean difference is under 0.5/255."""
 
@@ -34,7 +36,7 @@ def cache_folder() -> Path:
         except OSError:
             continue
         return folder
-    raise OSError("Neither ~/.cache nor the temporary folder can be written; set XDG_CACHE_HOME to one that can.")
+    raise MachineError("Neither ~/.cache nor the temporary folder can be written; set XDG_CACHE_HOME to one that can.")
 
 
 def light_panda_urdf() -> str:

@@ -13,6 +13,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
+from lerobot_constructskill.parsing import as_input
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED, FrozenViTChunkPolicy
 
@@ -62,8 +63,14 @@ class PolicyAgent:
 
     @classmethod
     def from_pretrained(cls, checkpoint: Path | str, device: str | None = None) -> "PolicyAgent":
-        """Load a checkpoint folder, or a name on the Hub, of any registered policy type."""
-        config = PreTrainedConfig.from_pretrained(checkpoint)
+        """Load a checkpoint folder, or a name on the Hub, of any registered policy type.
+
+        Raises:
+            ValueError: its configuration cannot be read, or is of an unknown type.
+            OSError: there is no such checkpoint.
+        """
+        with as_input():
+            config = PreTrainedConfig.from_pretrained(checkpoint)
         config.device = device or config.device
         config.pretrained_path = checkpoint
         policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)

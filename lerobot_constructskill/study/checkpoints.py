@@ -7,13 +7,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import draccus
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.errors import UserError, full_traceback
+from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.staging import staged
 from lerobot_constructskill.study.plan import Run, StudyPlan, Training
@@ -66,6 +68,17 @@ class Job:
     def checkpoint(self, run: Run) -> Path:
         return self.folder(run) / "pretrained_model"
 
+    def log(self, run: Run) -> Path:
+        """What a run said, and every traceback of its failures."""
+        return self.root / "logs" / f"{run.id}.log"
+
+    def keep(self, run: Run, error: Exception) -> None:
+        """Add an exception's traceback to the run's log."""
+        log = self.log(run)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("a") as file:
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{full_traceback(error)}\n")
+
 
 def demonstrations(job: Job, data: str | None = None) -> LeRobotDataset:
     """The data set of a configuration, of the job's own by default."""
@@ -109,7 +122,7 @@ def _train_together(job: Job, runs: list[Run], policy: dict[str, Any], training:
     is_blind = reference == "blind"
     features = _features(job, job.data, policy, is_blind)
     fields = {name: value for name, value in policy.items() if name != "type"}
-    config = draccus.decode(FrozenViTChunkConfig, fields | {"save_backbone": False, "push_to_hub": False})
+    config = decode(FrozenViTChunkConfig, fields | {"save_backbone": False, "push_to_hub": False})
     with timed(job.root, "training"):
         policies = train_seeds(config, features, [run.seed for run in runs], training)
     stats = features.meta.stats
@@ -137,8 +150,9 @@ def _validation_sets(
     for data in job.plan.data_of(job.runs[0].setting):
         try:
             other = features if data == job.data else _features(job, data, policy, is_blind)
-        except (OSError, ValueError) as error:
+        except (OSError, UserError) as error:
             logger.warning("%s is not validated on %s: %s", job.runs[0].variant, data, error)
+            job.keep(job.runs[0], error)
             continue
         if other.meta.features.keys() >= features.meta.features.keys():
             yield data, other
@@ -165,9 +179,9 @@ def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, 
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]
-        log = job.root / "logs" / f"{run.id}.log"
+        log = job.log(run)
         log.parent.mkdir(parents=True, exist_ok=True)
-        with timed(job.root, "training"), log.open("w") as output:
+        with timed(job.root, "training"), log.open("a") as output:
             status = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT).returncode
         if status:
             said = log.read_text().strip().splitlines() or ["nothing"]

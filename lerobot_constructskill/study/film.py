@@ -6,6 +6,7 @@ import numpy as np
 from lerobot.utils.io_utils import write_video
 
 from lerobot_constructskill.contract import FPS
+from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.plan import Run
 from lerobot_constructskill.study.simulators import Step
@@ -29,6 +30,6 @@ class Film:
         if run.seed != 0 or not self._frames:
             return None
         path = Path("videos") / f"{run.setting}-{run.variant}.mp4"
-        with replaced(root / path) as partial:
+        with quiet(), replaced(root / path) as partial:
             write_video(partial, self._frames, FPS)
         return str(path)

@@ -38,7 +38,7 @@ PACKAGES = (
 def execute(job: Job) -> Iterator[tuple[Run, list[Row]]]:
     """Train what is not trained yet, evaluate it, and yield each run's rows as soon as it has them.
 
-    A run that fails yields one row that says why.
+    A run that fails yields one row that says why, and its log has the traceback.
     """
     # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
     torch.set_flush_denormal(True)
@@ -86,6 +86,8 @@ def _finished(job: Job, run: Run, outcome: Outcome, video: str | None) -> list[R
 
 
 def _failed(job: Job, run: Run, error: Exception) -> Row:
+    """A failure's only row: one sentence. The traceback is in the run's log."""
+    job.keep(run, error)
     return replace(_row(job, run), error=" ".join(f"{type(error).__name__}: {error}".split()))
 
 

@@ -14,9 +14,9 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch.utils.data import DataLoader, Subset
-from tqdm import tqdm
 
 from lerobot_constructskill.contract import TRANSLATION
+from lerobot_constructskill.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def predict(
         batch_size: frames at a time.
     """
     predictions = []
-    for episode in tqdm(episodes, policy.name, unit="demo", leave=False):
+    for episode in Progress(episodes, policy.name, unit="demo", leave=False):
         row = dataset.meta.episodes[episode]
         frames = Subset(dataset, range(row["dataset_from_index"], row["dataset_to_index"]))
         policy.reset()

@@ -8,6 +8,7 @@ from itertools import combinations
 from typing import Any
 
 from lerobot_constructskill.contract import HELD_OUT_EVERY, get_task
+from lerobot_constructskill.errors import InputError
 
 REFERENCES = ("no_op", "random", "replay", "blind", "untrained", "expert")
 """Floors and ceilings that a study can run beside its variants."""
@@ -114,31 +115,31 @@ class StudyPlan:
     def __post_init__(self):
         for name in (self.name, *self.settings, *self.variants):
             if not NAME.fullmatch(name):
-                raise ValueError(f"'{name}' is no name for a study, setting or variant; use a-z, 0-9, '_' and '-'.")
+                raise InputError(f"'{name}' is no name for a study, setting or variant; use a-z, 0-9, '_' and '-'.")
         if taken := [name for name in self.variants if name in REFERENCES]:
-            raise ValueError(f"'{taken[0]}' is the name of a reference; call the variant something else.")
+            raise InputError(f"'{taken[0]}' is the name of a reference; call the variant something else.")
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
-                raise ValueError(f"A study needs at least one of {kind}.")
+                raise InputError(f"A study needs at least one of {kind}.")
         _check_known("reference", list(self.references), REFERENCES)
         counts = {"episodes": self.episodes, **self.references}
         for name, count in counts.items():
             if count < 1:
-                raise ValueError(f"{name} must be at least 1, not {count}.")
+                raise InputError(f"{name} must be at least 1, not {count}.")
         if not 0 < self.alpha < 1:
-            raise ValueError(f"alpha must lie between 0 and 1, not {self.alpha}.")
+            raise InputError(f"alpha must lie between 0 and 1, not {self.alpha}.")
         for setting in self.settings.values():
             get_task(setting.env.get("task", "brick_to_bin"))
         for name, variant in self.variants.items():
             _check_known(f"setting of variant '{name}'", variant.settings or [], self.settings)
             if variant.seeds < 1:
-                raise ValueError(f"Variant '{name}' needs at least one seed, not {variant.seeds}.")
+                raise InputError(f"Variant '{name}' needs at least one seed, not {variant.seeds}.")
             if "type" not in variant.policy:
-                raise ValueError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
+                raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
         for pair in self.comparisons or []:
             _check_known("variant in comparisons", pair, self.variants)
             if len(pair) != 2:
-                raise ValueError(f"A comparison is a pair of variants, not {pair}.")
+                raise InputError(f"A comparison is a pair of variants, not {pair}.")
 
     @property
     def runs(self) -> list[Run]:
@@ -184,7 +185,7 @@ class StudyPlan:
         for variant in self.variants.values():
             if variant.policy["type"] == "frozen_vit":
                 return variant
-        raise ValueError(f"The reference '{run.variant}' needs a variant of type frozen_vit to be made from.")
+        raise InputError(f"The reference '{run.variant}' needs a variant of type frozen_vit to be made from.")
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -203,4 +204,4 @@ class StudyPlan:
 def _check_known(what: str, given: list[str], known) -> None:
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise ValueError(f"Unknown {what} '{unknown[0]}'; there are: {', '.join(known)}.")
+        raise InputError(f"Unknown {what} '{unknown[0]}'; there are: {', '.join(known)}.")

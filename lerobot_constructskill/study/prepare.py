@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import draccus
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.device_utils import auto_select_torch_device
@@ -19,8 +18,10 @@ from torch import Tensor
 
 from lerobot_constructskill.demos.recorder import record
 from lerobot_constructskill.demos.settings import GenerateConfig, provenance
+from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 from lerobot_constructskill.hashing import data_sha256
+from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO
@@ -60,15 +61,15 @@ class Store:
         """Hash of the frames and videos of a configuration's data set, None while it has not been made."""
         try:
             _, root = self._demonstrations_of(config_file)
-        except (OSError, ValueError):
+        except (OSError, InputError):
             return None
         return _cached_sha256(root) if root.exists() else None
 
     def _demonstrations_of(self, config_file: str) -> tuple[GenerateConfig, Path]:
         if not Path(config_file).is_file():
-            raise FileNotFoundError(f"There is no constructskill-generate configuration '{config_file}'.")
+            raise MissingError(f"There is no constructskill-generate configuration '{config_file}'.")
         name = Path(config_file).stem
-        config = draccus.parse(GenerateConfig, config_path=config_file, args=[f"--repo_id=local/{name}"])
+        config = parse(GenerateConfig, [f"--repo_id=local/{name}"], config_file)
         return config, self.root / f"{name}-{_digest(provenance(config))}"
 
     def features(self, demonstrations: LeRobotDataset, policy: dict[str, Any], blind: bool = False) -> LeRobotDataset:

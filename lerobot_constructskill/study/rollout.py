@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.agents import Agent, Observation, attempt, encode_together, share_encoders
 from lerobot_constructskill.study.rows import STAGES
 from lerobot_constructskill.study.simulators import Simulators, Step, simulators
@@ -69,12 +69,19 @@ def roll_out(
         An agent's number and its outcome, as soon as it has finished or failed.
 
     Raises:
-        RuntimeError: a simulator's process died.
+        OSError: a simulator's process died.
     """
-    instruction = get_task(env_kwargs.get("task", "brick_to_bin")).instruction
-    with simulators(len(agents), env_kwargs, n_workers) as sims, tqdm(unit="step", desc="rollout", leave=False) as bar:
-        lanes = _Lanes(agents, instruction, sims, seeds, on_step)
+    task = get_task(env_kwargs.get("task", "brick_to_bin"))
+    longest = env_kwargs.get("episode_length") or task.horizon
+    most = len(agents) * len(seeds) * longest
+    with (
+        simulators(len(agents), env_kwargs, n_workers) as sims,
+        Progress(total=most, unit="step", desc="rollout") as bar,
+    ):
+        lanes = _Lanes(agents, task.instruction, sims, seeds, on_step)
+        bar.unpause()  # until now the simulators started
         while lanes.current:
+            bar.total = bar.n + lanes.steps_left(longest)
             bar.update(len(lanes.current))
             bar.set_postfix(running=len(lanes.current), refresh=False)
             lanes.advance()
@@ -108,6 +115,11 @@ class _Lanes:
         for i in finished:
             del self.current[i]
         self._start([i for i in finished if len(self.outcomes[i].episodes) < len(self.seeds)])
+
+    def steps_left(self, longest: int) -> int:
+        """At most so many steps are left, where an episode has at most `longest`."""
+        left = (self.outcomes[i].episodes for i in self.current)
+        return sum((len(self.seeds) - len(episodes) + 1) * longest - episodes[-1].steps for episodes in left)
 
     def settled(self) -> Iterator[tuple[int, Outcome]]:
         """The agents that have stopped since this was last asked."""

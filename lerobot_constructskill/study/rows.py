@@ -8,6 +8,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.staging import replaced
 
 STAGES = ("none", "lifted", "in_bin", "placed")
@@ -106,7 +107,7 @@ def _read_tables(paths: Iterable[Path]) -> pa.Table:
     for path in paths:
         tables.append(pq.read_table(path))
         if not tables[-1].schema.equals(SCHEMA):
-            raise ValueError(f"'{path}' is not a table of study rows of this version.")
+            raise InputError(f"'{path}' is not a table of study rows of this version.")
     return pa.concat_tables(tables)
 
 

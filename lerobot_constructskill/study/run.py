@@ -14,9 +14,11 @@ from pathlib import Path
 import draccus
 import pandas as pd
 import yaml
-from tqdm import tqdm
 
+from lerobot_constructskill.errors import InputError, TakenError
+from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.pools import open_pool
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.checkpoints import Job
 from lerobot_constructskill.study.jobs import execute
@@ -52,14 +54,14 @@ def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd
     Raises:
         ValueError: the folder holds another plan's results.
         FileExistsError: another process is running this study.
-        RuntimeError: a simulator's process died.
+        OSError: a simulator's process died.
     """
     with _claimed(root):
         _write_plan(plan, root)
         earlier, start = _wall_time(root), time.monotonic()
         runs = [*plan.reference_runs, *plan.runs]
         finished = [run for run in runs if _is_finished(root, run, options)]
-        with tqdm(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
+        with Progress(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
             for run, rows in _execute(_jobs(plan, root, store, runs, finished, options.together), options):
                 write_rows(rows, _row_file(root, run))
                 _merge(root, runs)
@@ -106,14 +108,14 @@ def _claimed(root: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise FileExistsError(f"Another process is running the study in {root} at this moment.") from None
+            raise TakenError(f"Another process is running the study in {root} at this moment.") from None
         yield
 
 
 def _write_plan(plan: StudyPlan, root: Path) -> None:
     path = root / PLAN
-    if path.exists() and draccus.decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
-        raise ValueError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
+    if path.exists() and decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
+        raise InputError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
     with replaced(path) as partial:
         partial.write_text(yaml.safe_dump(draccus.encode(plan), sort_keys=False))
 

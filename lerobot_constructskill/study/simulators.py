@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import MachineError, full_traceback
 
 PRELOADED = ["lerobot_constructskill.sim.register", "lerobot_constructskill.study.simulators"]
 """Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
@@ -30,7 +31,7 @@ class Simulators:
     """Equal environments, spread over worker processes; environment i lives in worker i % workers.
 
     Every method takes a mapping from an environment's number and answers with one, in which an environment that raised
-    has its exception. They raise `RuntimeError` where a worker died, for want of memory for instance.
+    has its exception. They raise `OSError` where a worker died, for want of memory for instance.
     """
 
     def __init__(self, workers: Sequence[Connection]):
@@ -89,7 +90,7 @@ def _receive(worker: Connection) -> dict[int, Any]:
     try:
         return worker.recv()
     except (EOFError, ConnectionError):
-        raise RuntimeError("A simulator's process died; run fewer at once if memory was short.") from None
+        raise MachineError("A simulator's process died; run fewer at once if memory was short.") from None
 
 
 def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:
@@ -133,4 +134,5 @@ def _attempt(verb: str, env: ConstructSkillEnv, argument: Any) -> Any:
     try:
         return _VERBS[verb](env, argument)
     except Exception as error:
+        error.add_note(full_traceback(error))  # an exception leaves its traceback behind when it leaves the process
         return error

@@ -17,13 +17,14 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
-from tqdm import tqdm
 
 from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import open_patches
 from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads, chunk_errors
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.plan import Training
 
 
@@ -40,7 +41,7 @@ def train_seeds(
     """
     template = make_policy(deepcopy(config), ds_meta=dataset.meta)
     if template.config.feature_column is None:
-        raise ValueError(
+        raise InputError(
             f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
             "constructskill-encode makes of a data set."
         )
@@ -170,7 +171,7 @@ def _step_together(
     n_steps = training.epochs * -(-len(orders[0].rows) // training.batch_size)
     schedule = config.get_scheduler_preset()
     scheduler = schedule.build(optimizer, n_steps) if schedule else None
-    for batch in tqdm(_batches(orders, training), f"training {len(heads)} seeds", n_steps, unit="step"):
+    for batch in Progress(_batches(orders, training), f"training {len(heads)} seeds", n_steps, unit="step"):
         target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
         seen = [column[batch].to(config.device).float() for column in inputs]
         raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)

@@ -1,6 +1,7 @@
 """Each kind of corruption is planted in a data set, and the check that is there for it finds and names it."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import pytest
 from lerobot_constructskill.data.checks import CHECKS, complaints
 from lerobot_constructskill.data.dataset import open_dataset
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.errors import InputError
 
 VIDEO = "videos/observation.images.base/chunk-000/file-000.mp4"
 
@@ -217,6 +219,44 @@ def test_a_file_that_cannot_be_read_is_named(name, copy):
     (copy / name).write_bytes(b"{")
     with pytest.raises(ValueError, match=f"{name} cannot be read"):
         open_dataset(copy)
+
+
+@pytest.mark.parametrize(
+    "corrupt, words",
+    [
+        (column("dart.noise", lambda noise: noise[:, :2]), "shape \\(2,\\), not \\(3,\\)"),
+        (rows(lambda table: table.drop(columns="phase")), "no column phase"),
+        (metadata(SIDECAR, lambda facts: facts.pop("generator")), f"{SIDECAR} has no 'generator'"),
+        (metadata("meta/info.json", lambda info: info["features"].pop("dart.noise")), "has no 'dart.noise'"),
+    ],
+)
+def test_what_is_missing_is_named_by_every_check_that_needs_it(corrupt, words, copy):
+    corrupt(copy)
+    found = complaints(open_dataset(copy), CHECKS["Noise"])
+    assert found and re.search(words, found[0])
+
+
+@pytest.mark.parametrize(
+    "corrupt, words",
+    [
+        (rows(lambda table: table.iloc[:0]), "no frames"),
+        (metadata("meta/info.json", lambda info: info.pop("features")), "meta/info.json has no 'features'"),
+    ],
+)
+def test_a_set_that_holds_nothing_is_not_opened(corrupt, words, copy):
+    corrupt(copy)
+    with pytest.raises(InputError, match=words):
+        open_dataset(copy)
+
+
+@pytest.mark.parametrize("error", [KeyError, IndexError, ValueError])
+def test_an_error_of_a_check_is_no_fault_of_the_data(error, pristine):
+    def broken(data):
+        raise error("in the check itself")
+        yield
+
+    with pytest.raises(error, match="in the check itself"):
+        complaints(open_dataset(pristine), broken)
 
 
 def check(*flags):

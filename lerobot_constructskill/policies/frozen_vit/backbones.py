@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
+from lerobot_constructskill.errors import InputError
+
 IMAGE_SIZE = 224
 """Height and width every image is resized to, in pixels (paper, section II)."""
 
@@ -176,5 +178,5 @@ def get_backbone(name: str) -> Backbone:
         ValueError: there is no such backbone; the message lists those there are.
     """
     if name not in BACKBONES:
-        raise ValueError(f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}.")
+        raise InputError(f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}.")
     return BACKBONES[name]

@@ -8,6 +8,8 @@ from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_constructskill.errors import InputError
+
 from .backbones import IMAGE_SIZE, get_backbone
 from .features import feature_key
 from .precision import AUTO, PRECISIONS
@@ -119,32 +121,32 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         _check_choice("readout", self.readout, tuple(READOUTS))
         _check_crop(self.crop)
         if self.standardize_features and self.readout != "cls":
-            raise ValueError(
+            raise InputError(
                 f"standardize_features serves readout=cls alone, got readout={self.readout}: the statistics of a "
                 "feature set are those of its pooled feature."
             )
         _check_action_names(self.action_names)
         if self.n_obs_steps != 1:
-            raise ValueError(f"n_obs_steps must be 1 (frozen_vit sees one frame), got {self.n_obs_steps}.")
+            raise InputError(f"n_obs_steps must be 1 (frozen_vit sees one frame), got {self.n_obs_steps}.")
         if self.chunk_size < 1:
-            raise ValueError(f"chunk_size must be at least 1, got {self.chunk_size}.")
+            raise InputError(f"chunk_size must be at least 1, got {self.chunk_size}.")
         if not 1 <= self.n_action_steps <= self.chunk_size:
-            raise ValueError(
+            raise InputError(
                 f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, got {self.n_action_steps}."
             )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
-            raise ValueError(
+            raise InputError(
                 f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
                 "temporal_ensemble_coeff=null to take several steps of one chunk."
             )
         if self.scheduler_warmup_steps is not None and self.scheduler_warmup_steps < 0:
-            raise ValueError(f"scheduler_warmup_steps must be at least 0, got {self.scheduler_warmup_steps}.")
+            raise InputError(f"scheduler_warmup_steps must be at least 0, got {self.scheduler_warmup_steps}.")
         if self.head_hidden_dim is not None and self.head_hidden_dim < 1:
-            raise ValueError(f"head_hidden_dim must be at least 1, got {self.head_hidden_dim}.")
+            raise InputError(f"head_hidden_dim must be at least 1, got {self.head_hidden_dim}.")
         if self.regression_weight <= 0:
-            raise ValueError(f"regression_weight must be above 0, got {self.regression_weight}.")
+            raise InputError(f"regression_weight must be above 0, got {self.regression_weight}.")
         if self.action_scale <= 0:
-            raise ValueError(f"action_scale must be above 0 (metres and radians), got {self.action_scale}.")
+            raise InputError(f"action_scale must be above 0 (metres and radians), got {self.action_scale}.")
 
     @property
     def image_key(self) -> str:
@@ -169,7 +171,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         names = list(names) if isinstance(names, list | tuple) else names
         _check_action_names(names)
         if self.pretrained_path and names != self.action_names:
-            raise ValueError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
+            raise InputError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
         self.action_names = names
         self._feature_column = features.get(self.feature_key)
 
@@ -184,15 +186,15 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         """
         inputs, outputs = self.input_features or {}, self.output_features or {}
         if self.image_key not in inputs and self.feature_key not in inputs:
-            raise ValueError(
+            raise InputError(
                 f"frozen_vit needs {self.image_key} or {self.feature_key}; the inputs are: "
                 f"{', '.join(inputs) or 'none'} (choose another camera with --policy.camera)."
             )
         if self.use_state and OBS_STATE not in inputs:
-            raise ValueError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")
+            raise InputError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")
         shape = outputs[ACTION].shape if ACTION in outputs else (len(self.action_names),)
         if tuple(shape) != (len(self.action_names),):
-            raise ValueError(f"The actions have shape {tuple(shape)}, but action_names are {self.action_names}.")
+            raise InputError(f"The actions have shape {tuple(shape)}, but action_names are {self.action_names}.")
         camera = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
         self.input_features = {self.image_key: inputs.get(self.image_key, camera)}
         if self.use_state:
@@ -222,7 +224,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 
 def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
-        raise ValueError(f"{field_name} must be one of {', '.join(choices)}, got '{value}'.")
+        raise InputError(f"{field_name} must be one of {', '.join(choices)}, got '{value}'.")
 
 
 def _check_crop(crop: Any) -> None:
@@ -230,7 +232,7 @@ def _check_crop(crop: Any) -> None:
         return
     left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
     if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
-        raise ValueError(
+        raise InputError(
             f"crop must be left, top, right and bottom in shares of the image, such as [0.25, 0.25, 0.75, 0.75]; "
             f"got {crop}."
         )
@@ -246,7 +248,7 @@ def _check_action_names(names: Any) -> None:
         and set(names[:-1]) <= set(known)
     )
     if not served:
-        raise ValueError(
+        raise InputError(
             f"frozen_vit acts in one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}'; "
             f"got action names {names}."
         )

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_constructskill.errors import InputError, MissingError
+
 from .backbones import IMAGE_SIZE, Backbone
 from .precision import PRECISIONS
 
@@ -33,7 +35,7 @@ def open_patches(root: Path) -> Tensor:
     """
     file = Path(root) / PATCHES_FILE
     if not file.exists():
-        raise FileNotFoundError(
+        raise MissingError(
             f"The feature set in {root} has no {PATCHES_FILE}, which this readout needs: encode the data set with "
             "constructskill-encode --patches=true."
         )
@@ -88,7 +90,7 @@ def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> No
     if tuple(column["shape"]) != (dim,):
         different.append(f"shape {tuple(column['shape'])} (the policy: {(dim,)})")
     if different:
-        raise ValueError(
+        raise InputError(
             f"The data set's features were not made by this policy's encoder: {'; '.join(different)}; "
             "encode the data set again with constructskill-encode or match the policy's backbone fields."
         )

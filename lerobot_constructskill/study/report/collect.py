@@ -6,6 +6,7 @@ from itertools import groupby
 import numpy as np
 import pandas as pd
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.plan import StudyPlan
 from lerobot_constructskill.study.report.findings import Findings, Line, Outcome, RateTest, SettingFindings, Table
 from lerobot_constructskill.study.stats.comparisons import compare, holm
@@ -56,14 +57,14 @@ def check_rows(plan: StudyPlan, rows: pd.DataFrame) -> None:
     """Raise ValueError unless all `rows` are the plan's, each episode once."""
     foreign = rows.loc[rows["plan_sha256"] != plan.sha256, "plan_sha256"]
     if len(foreign):
-        raise ValueError(
+        raise InputError(
             f"{len(foreign)} of {len(rows)} rows come from another plan ({foreign.iloc[0][:12]}) than plan.yaml "
             f"({plan.sha256[:12]}); report each study from its own folder."
         )
     twice = rows.duplicated(["setting", "variant", "is_reference", "training_seed", "episode"])
     if twice.any():
         row = rows[twice].iloc[0]
-        raise ValueError(
+        raise InputError(
             f"Episode {row['episode']} of {row['setting']}/{row['variant']}/seed_{row['training_seed']} stands in the "
             "rows twice; every episode must be counted once."
         )

@@ -14,6 +14,8 @@ import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.staging import replaced
 from lerobot_constructskill.study.plan import StudyPlan
 from lerobot_constructskill.study.report import figures, wording
@@ -70,11 +72,11 @@ def read_study(root: Path) -> tuple[StudyPlan, pd.DataFrame]:
     plan, rows = root / "plan.yaml", root / "rows.parquet"
     for path in (plan, rows):
         if not path.is_file():
-            raise FileNotFoundError(f"'{root}' is no folder of a study: {path.name} is missing.")
+            raise MissingError(f"'{root}' is no folder of a study: {path.name} is missing.")
     try:
-        decoded = draccus.decode(StudyPlan, yaml.safe_load(plan.read_text()))
-    except (draccus.utils.DecodingError, yaml.YAMLError, TypeError) as error:
-        raise ValueError(f"'{plan}' is not a study's plan: {error}") from None
+        decoded = decode(StudyPlan, yaml.safe_load(plan.read_text()))
+    except (InputError, yaml.YAMLError) as error:
+        raise InputError(f"'{plan}' is not a study's plan: {error}") from None
     return decoded, read_rows(rows)
 
 

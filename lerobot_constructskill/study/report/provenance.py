@@ -8,6 +8,7 @@ from urllib.parse import quote
 
 import pandas as pd
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.report.findings import SettingFindings
 
 INLINED = 2 * 1024**2
@@ -79,7 +80,7 @@ def extra_facts(path: Path) -> list[tuple[str, str]]:
     except ValueError:
         facts = None
     if not isinstance(facts, dict):
-        raise ValueError(f"'{path}' must hold one JSON object of names and values.")
+        raise InputError(f"'{path}' must hold one JSON object of names and values.")
     return [(str(name).replace("_", " "), str(value)) for name, value in facts.items()]
 
 

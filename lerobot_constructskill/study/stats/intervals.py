@@ -5,6 +5,7 @@ from typing import NamedTuple
 from scipy.stats import binomtest
 from statsmodels.stats.proportion import confint_proportions_2indep
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.stats.outcomes import Counts
 
 
@@ -56,4 +57,4 @@ def _binomial(counts: Counts, level: float, method: str) -> Estimate:
 
 def _require_seeds(counts: Counts) -> None:
     if counts.seeds < 1:
-        raise ValueError("An interval needs at least one seed; this variant has none.")
+        raise InputError("An interval needs at least one seed; this variant has none.")

@@ -1,0 +1,36 @@
+"""What is meant for the user, told apart from what is a fault of ours. Standard library only.
+
+A `UserError` is a sentence that says what is wrong with a request, a file or a machine, and what to do about it. Any
+other exception that leaves the package is a defect of it, or an `OSError` of the operating system.
+"""
+
+from traceback import TracebackException
+
+
+class UserError(Exception):
+    """A sentence for the user. Each kind of it is also the exception that Python's users expect there."""
+
+
+class InputError(UserError, ValueError):
+    """A value, a file or a combination of them that cannot be used."""
+
+
+class MissingError(UserError, FileNotFoundError):
+    """Something that was named is not there."""
+
+
+class TakenError(UserError, FileExistsError):
+    """Something is there already, or another process is making it."""
+
+
+class MachineError(UserError, OSError):
+    """This machine, its network or the Hub does not do its part."""
+
+
+def full_traceback(error: BaseException) -> str:
+    """Every traceback of a chain of exceptions, also those that `raise ... from None` keeps from the reader."""
+    whole = link = TracebackException.from_exception(error)
+    while link is not None:
+        link.__suppress_context__ = False
+        link = link.__cause__ or link.__context__
+    return "".join(whole.format())

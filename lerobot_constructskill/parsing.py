@@ -1,0 +1,56 @@
+"""Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
+
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.argparsing import ArgumentParser
+
+from lerobot_constructskill.errors import InputError
+
+
+def parse[Config](
+    config_class: type[Config],
+    flags: Sequence[str] | None = None,
+    config_path: Path | str | None = None,
+    epilog: str | None = None,
+) -> Config:
+    """Read a configuration from flags, the command line's by default, and a YAML file that they are put over.
+
+    Raises:
+        InputError: they do not make a configuration.
+        OSError: the file cannot be opened.
+    """
+    with as_input():
+        return ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
+
+
+def decode[Config](config_class: type[Config], fields: Mapping[str, Any]) -> Config:
+    """Make a configuration of plain values.
+
+    Raises:
+        InputError: they do not make one.
+    """
+    with as_input():
+        return draccus.decode(config_class, fields)
+
+
+@contextmanager
+def as_input() -> Iterator[None]:
+    """Turn what the block raises into an `InputError`, but for `OSError` and for errors of our own configurations."""
+    try:
+        yield
+    except (OSError, InputError):
+        raise
+    except (TypeError, AttributeError):  # draccus merges fields, and copies them, before it looks at them
+        raise InputError("The configuration's file is empty or not a mapping of fields.") from None
+    except Exception as error:  # those of draccus, argparse and YAML have no base in common
+        root = error
+        while root.__cause__ is not None:
+            root = root.__cause__
+        if any(frame.name == "__post_init__" for frame in traceback.extract_tb(root.__traceback__)):
+            raise root from None  # a configuration of ours, which refuses the values or is broken itself
+        raise InputError(str(error if isinstance(error, draccus.utils.DecodingError) else root)) from error

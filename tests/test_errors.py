@@ -1,0 +1,134 @@
+"""Whatever goes wrong in a console command: one sentence and a status for the user, the traceback in a log."""
+
+import ast
+import pickle
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, full_traceback
+
+REPOSITORY = Path(__file__).parents[1]
+MODULES = sorted((REPOSITORY / "lerobot_constructskill").rglob("*.py"))
+PYTHONS = {"ValueError", "OSError", "FileNotFoundError", "FileExistsError"}
+COMMANDS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+
+BREAK = """
+import importlib, sys
+sys.argv = ["{command}", *{flags}]
+module = importlib.import_module("{module}")
+from lerobot_constructskill import parsing
+def broken(*arguments, **options):
+    assert "--debug" not in sys.argv
+    raise {error}
+parsing.parse = broken
+module.diagnose = broken
+module.{function}()
+"""
+"""A command whose first piece of work is broken: constructskill-doctor has no configuration to parse."""
+
+
+def run(command: str, error: str, state: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+    module, function = COMMANDS[command].split(":")
+    code = BREAK.format(command=command, flags=flags, module=module, function=function, error=error)
+    variables = {"XDG_STATE_HOME": str(state), "PATH": "", "TMPDIR": str(state.parent)}
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, tmp_path: Path) -> None:
+    done = run(command, "KeyError('a b')", tmp_path, "--debug")
+    log = tmp_path / "constructskill" / f"{command}.log"
+    said = f"{command}: this is a fault of ours, not of your input: KeyError: 'a b'; the traceback is in {log}\n"
+    assert done.returncode == 70 and done.stderr.endswith(said)
+    for told in done.stderr, log.read_text():
+        assert "Traceback" in told and "in broken\nKeyError: 'a b'" in told
+
+
+def test_without_debug_a_fault_is_one_sentence(tmp_path: Path) -> None:
+    for error in "KeyError('a')", "ValueError('operands could not be broadcast together')":
+        done = run("constructskill-report", error, tmp_path)
+        assert done.returncode == 70 and len(done.stderr.splitlines()) == 1
+    assert (tmp_path / "constructskill" / "constructskill-report.log").read_text().count("Traceback") == 2
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) -> None:
+    call = [Path(sys.executable).parent / command, "--no_such_flag=3"]
+    done = subprocess.run(call, capture_output=True, text=True, env={"XDG_STATE_HOME": str(tmp_path)})
+    assert done.returncode == 1 and done.stderr == f"{command}: unrecognized arguments: --no_such_flag=3\n"
+    assert "InputError" in (tmp_path / "constructskill" / f"{command}.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        ("OSError(28, 'No space left on device')", 1, "[Errno 28] No space left on device"),
+        ("ModuleNotFoundError('No module named x', name='x')", 1, "No module named x; constructskill-doctor tells"),
+        ("KeyboardInterrupt", 130, "interrupted"),
+    ],
+)
+def test_what_is_no_fault_of_ours_is_not_called_one(error: str, status: int, said: str, tmp_path: Path) -> None:
+    done = run("constructskill-report", error, tmp_path)
+    assert done.returncode == status and done.stderr.startswith(f"constructskill-report: {said}")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "state").touch()  # a file, below which there can be no folder
+    done = run("constructskill-report", "KeyError('a')", tmp_path / "state")
+    log = Path(done.stderr.strip().rsplit(" ", 1)[1])
+    assert log.parent == tmp_path and "in broken\nKeyError: 'a'" in log.read_text()
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda path: path.stem)
+def test_what_is_raised_for_the_user_is_told_from_what_python_raises(module: Path) -> None:
+    raises = [node.exc for node in ast.walk(ast.parse(module.read_text())) if isinstance(node, ast.Raise)]
+    raised = {ast.unparse(error.func) for error in raises if isinstance(error, ast.Call)}
+    assert not raised & PYTHONS, "raise a class of errors.py, or RuntimeError where only a defect leads"
+
+
+@pytest.mark.parametrize("kind", [InputError, MissingError, TakenError, MachineError])
+def test_a_sentence_survives_the_way_between_processes(kind: type[UserError]) -> None:
+    error = pickle.loads(pickle.dumps(kind("a sentence.")))
+    assert type(error) is kind and str(error) == "a sentence."
+
+
+def test_the_traceback_tells_what_a_sentence_hides() -> None:
+    try:
+        try:
+            {}["the cause"]
+        except KeyError:
+            raise InputError("a sentence.") from None
+    except InputError as error:
+        assert "KeyError: 'the cause'" in full_traceback(error)
+
+
+def test_a_failed_run_of_a_study_keeps_its_traceback(tmp_path: Path) -> None:
+    from lerobot_constructskill.study.checkpoints import Job
+    from lerobot_constructskill.study.jobs import execute
+    from lerobot_constructskill.study.plan import Setting, StudyPlan, Variant
+    from lerobot_constructskill.study.prepare import Store
+
+    plan = StudyPlan("x", {"fixed": Setting("absent.yaml")}, {"a": Variant({"type": "frozen_vit"}, seeds=2)})
+    job = Job(plan, tuple(plan.runs), tmp_path, Store(tmp_path / "data"))
+    for run, [row] in execute(job):
+        said = "There is no constructskill-generate configuration 'absent.yaml'."
+        assert row.error.endswith(said)
+        log = (tmp_path / "logs" / f"{run.id}.log").read_text()
+        assert "Traceback" in log and "in _demonstrations_of" in log and said in log
+
+
+def test_a_traceback_comes_home_from_a_simulators_process() -> None:
+    from lerobot_constructskill.study.simulators import _attempt
+
+    class Broken:
+        def reset(self, seed):
+            raise KeyError(seed)
+
+    error = pickle.loads(pickle.dumps(_attempt("reset", Broken(), 7)))
+    assert type(error) is KeyError and error.args == (7,)
+    assert "in reset\n    raise KeyError(seed)" in full_traceback(error)
