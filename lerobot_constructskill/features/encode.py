@@ -16,7 +16,6 @@ from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
-from tqdm import tqdm
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.hashing import data_sha256
@@ -25,6 +24,7 @@ from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncod
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.staging import replaced
 
 PARTS = "encoded"
@@ -102,7 +102,7 @@ def _encode_frames(
     missing = [episode for episode in dataset.meta.episodes if not _part(parts, episode).exists()]
     finished = dataset.num_frames - sum(episode["length"] for episode in missing)
     # Frames of an earlier run are where the bar starts, not part of its rate.
-    with tqdm(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
+    with Progress(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
         for episode in missing:
             pooled, tokens = [], []
             for images in _batches(dataset, key, episode, batch_size):

@@ -63,9 +63,7 @@ def test_a_checkpoint_crosses_over_on_purpose_alone(machine, make_policy, images
     machine("float32")
     batch = {"observation.images.base": images}
     stranded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "made")  # so that it can be pushed from here
-    with pytest.raises(
-        ValueError, match="checkpoint that was made in bfloat16 runs with --policy.backbone_precision="
-    ):
+    with pytest.raises(ValueError, match="made in bfloat16 runs with --policy.backbone_precision=float32"):
         stranded.select_action(batch)
     config = FrozenViTChunkConfig.from_pretrained(tmp_path / "made", cli_overrides=["--backbone_precision=float32"])
     crossed = FrozenViTChunkPolicy.from_pretrained(tmp_path / "made", config=config)
