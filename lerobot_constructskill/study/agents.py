@@ -2,7 +2,9 @@
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -73,7 +75,8 @@ class PolicyAgent:
             config = PreTrainedConfig.from_pretrained(checkpoint)
         config.device = device or config.device
         config.pretrained_path = checkpoint
-        policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+        with redirect_stdout(StringIO()):  # LeRobot prints where it loads weights from, for every policy
+            policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
         on_device = {"device_processor": {"device": config.device}}
         processors = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=on_device)
         return cls(policy, *processors)

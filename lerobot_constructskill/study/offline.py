@@ -121,14 +121,18 @@ def predict(
         episodes: which demonstrations.
         batch_size: frames at a time.
     """
+    rows = [dataset.meta.episodes[episode] for episode in episodes]
+    spans = [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
     predictions = []
-    for episode in Progress(episodes, policy.name, unit="demo", leave=False):
-        row = dataset.meta.episodes[episode]
-        frames = Subset(dataset, range(row["dataset_from_index"], row["dataset_to_index"]))
-        policy.reset()
-        batches = [_chunks(policy, preprocess, postprocess, batch) for batch in DataLoader(frames, batch_size)]
-        labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
-        predictions.append(Predictions(labels, chunks))
+    with Progress(total=sum(map(len, spans)), desc=policy.name, unit="frame", leave=False) as bar:
+        for span in spans:
+            policy.reset()
+            batches = []
+            for batch in DataLoader(Subset(dataset, span), batch_size):
+                batches.append(_chunks(policy, preprocess, postprocess, batch))
+                bar.update(len(batch["action"]))
+            labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
+            predictions.append(Predictions(labels, chunks))
     return predictions
 
 
