@@ -30,6 +30,7 @@ from lerobot_constructskill.contract import (
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.perturb import Draws
+from lerobot_constructskill.sim.shader import colour_shader
 from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
 
 WALL = 0.005
@@ -175,7 +176,14 @@ class PickPlaceEnv(BaseEnv):
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
-        return CameraConfig(camera.name, width=IMAGE_SIZE, height=IMAGE_SIZE, fov=camera.fov, **view)
+        shader = colour_shader() if self._is_colour_enough() else None
+        size = {"width": IMAGE_SIZE, "height": IMAGE_SIZE}
+        return CameraConfig(camera.name, fov=camera.fov, shader_config=shader, **size, **view)
+
+    def _is_colour_enough(self) -> bool:
+        """Whether observations are colour pictures alone, rendered on a CPU."""
+        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
+        return asked == {"rgb"} and not self.backend.render_device.is_cuda()
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
