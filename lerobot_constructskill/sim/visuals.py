@@ -18,6 +18,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots import Panda
 from PIL import Image
 
+from lerobot_constructskill.sim.control import QuickMimicController, QuickPoseController
+
 LIGHT_TRIANGLES = 4_000
 """Triangles of the whole light robot; at 224 x 224 pixels the mean difference is under 0.5/255."""
 
@@ -93,8 +95,22 @@ def _decimate(scene: trimesh.Scene, fraction: float) -> None:
 
 
 @register_agent()
-class LightPanda(Panda):
-    """ManiSkill's Panda, drawn with a few thousand triangles. Same links, collisions and controllers."""
+class QuickPanda(Panda):
+    """ManiSkill's Panda, whose `pd_ee_delta_pose` comes to the same numbers sooner on a CPU."""
+
+    uid = "constructskill_panda"
+
+    @property
+    def _controller_configs(self):
+        configs = super()._controller_configs
+        configs["pd_ee_delta_pose"]["arm"].controller_cls = QuickPoseController
+        configs["pd_ee_delta_pose"]["gripper"].controller_cls = QuickMimicController
+        return configs
+
+
+@register_agent()
+class LightPanda(QuickPanda):
+    """The same, drawn with a few thousand triangles. Same links, collisions and controllers."""
 
     uid = "constructskill_panda_light"
 
