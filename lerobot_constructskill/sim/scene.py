@@ -31,7 +31,9 @@ from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.perturb import Draws
-from lerobot_constructskill.sim.visuals import LightPanda, mottled, textured
+from lerobot_constructskill.sim.poses import seen_from
+from lerobot_constructskill.sim.shader import colour_shader
+from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
 
 WALL = 0.005
 """Thickness of the bin's walls and floor, in metres (paper, section II)."""
@@ -94,7 +96,7 @@ class PickPlaceEnv(BaseEnv):
     environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
     """
 
-    SUPPORTED_ROBOTS = ["panda", LightPanda.uid]
+    SUPPORTED_ROBOTS = ["panda", QuickPanda.uid, LightPanda.uid]
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
     # The four geometry constants, in metres.
@@ -137,7 +139,7 @@ class PickPlaceEnv(BaseEnv):
         self.cameras = tuple(cameras)
         self.light_robot = render_backend in ("cpu", "sapien_cpu") if light_robot is None else light_robot
         if robot_uids is None:
-            robot_uids = LightPanda.uid if self.light_robot else "panda"
+            robot_uids = LightPanda.uid if self.light_robot else QuickPanda.uid
         try:
             super().__init__(
                 *args,
@@ -176,7 +178,14 @@ class PickPlaceEnv(BaseEnv):
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
-        return CameraConfig(camera.name, width=IMAGE_SIZE, height=IMAGE_SIZE, fov=camera.fov, **view)
+        shader = colour_shader() if self._is_colour_enough() else None
+        size = {"width": IMAGE_SIZE, "height": IMAGE_SIZE}
+        return CameraConfig(camera.name, fov=camera.fov, shader_config=shader, **size, **view)
+
+    def _is_colour_enough(self) -> bool:
+        """Whether observations are colour pictures alone, rendered on a CPU."""
+        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
+        return asked == {"rgb"} and not self.backend.render_device.is_cuda()
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -343,7 +352,7 @@ class PickPlaceEnv(BaseEnv):
         The gripper points down, half a turn about x, where the usual axis-angle jumps between +pi and -pi; the
         sign of the quaternion is chosen so that the x component stays positive and continuous there.
         """
-        tcp = self.agent.robot.pose.inv() * self.agent.tcp.pose
+        tcp = seen_from(self.agent.robot.root, self.agent.tcp)
         rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q))
         return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
 
