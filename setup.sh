@@ -17,6 +17,15 @@ say() { printf 'setup: %s\n' "$*"; }
 warn() { printf 'setup: warning: %s\n' "$*" >&2; }
 die() { printf 'setup: error: %s\n' "$*" >&2; exit 1; }
 
+# The machines for which SAPIEN, PyTorch and OpenVINO all have wheels.
+check_machine() {
+    case "$(uname -sm)" in
+        "Linux x86_64") ;;
+        "Darwin arm64") warn "this was never tried on macOS; going on." ;;
+        *) die "this needs x86-64 Linux: SAPIEN, PyTorch or OpenVINO has no wheel for $(uname -sm)." ;;
+    esac
+}
+
 # --- system packages -------------------------------------------------------------------------------------------
 
 installed_version() { dpkg-query -W -f '${db:Status-Abbrev} ${Version}' "$1" 2>/dev/null | awk '$1 == "ii" {print $2}'; }
@@ -272,6 +281,7 @@ renew_pins() {
 
 main() {
     cd "$(dirname "${BASH_SOURCE[0]}")"
+    check_machine
     case "${1:-setup}" in
         setup)
             setup_system

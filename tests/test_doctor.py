@@ -149,6 +149,22 @@ def test_setup_judges_mesa(version: str, good: bool) -> None:
     assert (shell('new_enough "$1"', version).returncode == 0) is good
 
 
+@pytest.mark.parametrize(
+    ("machine", "refused", "said"),
+    [
+        ("Linux x86_64", False, ""),
+        ("Darwin arm64", False, "never tried on macOS"),
+        ("Linux aarch64", True, "no wheel for Linux aarch64"),
+        ("Darwin x86_64", True, "no wheel for Darwin x86_64"),
+    ],
+)
+def test_setup_refuses_a_machine_without_wheels(machine: str, refused: bool, said: str) -> None:
+    checked = shell('machine=$1; uname() { echo "$machine"; }; check_machine', machine)
+    assert (checked.returncode != 0) is refused
+    assert said in checked.stderr
+    assert len(checked.stderr.splitlines()) == bool(said)
+
+
 def test_setup_passes_over_a_python_that_does_not_run(tmp_path: Path) -> None:
     shim = tmp_path / "python3.12"
     shim.write_text("#!/bin/sh\necho 'python3.12: command not found' >&2\nexit 127\n")
