@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 DISTRIBUTION = "lerobot_env_constructskill"
-PYTHON = (3, 12)
+PYTHONS = ((3, 12), (3, 13))
+"""Those that `make setup` takes, for which every pinned package has a wheel."""
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
@@ -44,10 +45,10 @@ class Probe:
 
 def judge_python(version: tuple[int, int]) -> Finding:
     text = ".".join(map(str, version))
-    if version < PYTHON:
+    if version < PYTHONS[0]:
         return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12; run `make setup`.")
-    if version > PYTHON:
-        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 this was tested with.")
+    if version not in PYTHONS:
+        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 and 3.13 this was tested with.")
     return Finding(Level.OK, "Python", text)
 
 
