@@ -254,6 +254,16 @@ assert distribution("lerobot_env_constructskill").metadata["Name"] == "lerobot_e
 PYTHON
 }
 
+# torchcodec wants Python's shared library, which Debian and Ubuntu keep in a package of its own.
+setup_libpython() {
+    local package
+    package=$(.venv/bin/python -c 'import sysconfig; print("libpython" + sysconfig.get_python_version())')
+    .venv/bin/python -c "import ctypes; ctypes.CDLL('$package.so.1.0')" 2>/dev/null && return 0
+    say "installing $package, for torchcodec"
+    { command -v apt-get >/dev/null && can_be_root && apt_install "$package"; } ||
+        warn "no $package to be had; LeRobot decodes video with PyAV instead of torchcodec."
+}
+
 setup_venv() {
     local python
     venv_is_ready && return 0
@@ -267,6 +277,7 @@ setup_venv() {
     "$UV" pip install --quiet --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]" ||
         die "the packages could not be installed; see the lines above."
     check_name
+    setup_libpython
     fingerprint >"$STAMP"
 }
 

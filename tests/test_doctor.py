@@ -63,6 +63,7 @@ def test_complaints_name_their_cause() -> None:
     assert "opencv-python and opencv-python-headless" in checks.judge_opencv(checks.OPENCV[:2]).message
     assert "lerobot is 0.5 (needs <0.7,>=0.6.1)" in checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
+    assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb", "")).message
 
 

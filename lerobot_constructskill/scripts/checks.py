@@ -145,8 +145,10 @@ def judge_plugin(probe: Probe) -> Finding:
 def judge_ffmpeg(probe: Probe) -> Finding:
     if probe.ok:
         return Finding(Level.OK, "FFmpeg", "torchcodec loads its shared libraries")
+    package = re.search(r"libpython\d\.\d+", probe.reason)
+    missing = package[0] if package else "ffmpeg"
     return Finding(
-        Level.WARN, "FFmpeg", "torchcodec cannot load it, LeRobot decodes with PyAV; apt-get install ffmpeg."
+        Level.WARN, "FFmpeg", f"torchcodec finds no {missing}, LeRobot decodes with PyAV; apt-get install {missing}."
     )
 
 

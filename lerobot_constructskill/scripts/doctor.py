@@ -43,7 +43,15 @@ from lerobot.envs.configs import EnvConfig
 print("frozen_vit" in PreTrainedConfig.get_known_choices(), "constructskill" in EnvConfig.get_known_choices())
 """
 
-DECODE = "from torchcodec.decoders import VideoDecoder"
+# torchcodec's own complaint names every FFmpeg that is not here, and not the Python library that may be missing.
+DECODE = """
+import ctypes, sysconfig
+try:
+    from torchcodec.decoders import VideoDecoder
+except RuntimeError:
+    ctypes.CDLL(f"libpython{sysconfig.get_python_version()}.so.1.0")
+    raise
+"""
 
 # Asks whether the weights are there, not for the weights: those of all backbones together are 0.5 GB.
 FIND_WEIGHTS = """
