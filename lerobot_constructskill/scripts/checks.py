@@ -104,11 +104,15 @@ def judge_opencv(names: Sequence[str]) -> Finding:
 def judge_mesa(version: str | None, gpu: bool) -> Finding:
     """Judge Debian's version of mesa-vulkan-drivers; None where it is not installed or not known."""
     if gpu:
-        return Finding(Level.OK, "Mesa", "not needed: there is an NVIDIA GPU")
+        return Finding(Level.OK, "Mesa", "not needed where the NVIDIA GPU renders: see Vulkan")
     wanted = ".".join(map(str, MESA_MINIMUM))
     numbers = re.match(r"(?:\d+:)?(\d+)\.(\d+)", version or "")
     if numbers is None:
-        return Finding(Level.WARN, "Mesa", f"no package mesa-vulkan-drivers found; run `make setup` (>= {wanted}).")
+        return Finding(
+            Level.WARN,
+            "Mesa",
+            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, run `make setup` (>= {wanted}).",
+        )
     if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
         return Finding(
             Level.FAIL,

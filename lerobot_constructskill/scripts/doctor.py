@@ -23,13 +23,16 @@ from lerobot_constructskill.scripts.checks import (
     judge_weights,
 )
 
-PROBE_TIMEOUT_S = 180
+PROBE_TIMEOUT_S = 600  # importing LeRobot took 3 minutes on one core of a busy machine
 
+# The choice of `best_render_backend`, without ManiSkill.
 RENDER = """
 import sapien
 try:
     device = sapien.Device("cuda")
 except RuntimeError:
+    device = None
+if device is None or not device.can_render():
     device = sapien.Device("cpu")
 sapien.render.RenderSystem(device)
 print(device.name)
@@ -69,7 +72,7 @@ def probe(code: str) -> Probe:
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return Probe(False, "", f"no answer within {PROBE_TIMEOUT_S} s")
+        return Probe(False, "", f"no answer within {PROBE_TIMEOUT_S} s; is this machine busy?")
     complaint = (done.stderr.strip().splitlines() or [""])[-1]
     if done.returncode < 0:
         complaint = f"the process died of signal {-done.returncode}"
