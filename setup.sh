@@ -146,7 +146,7 @@ setup_system() {
     if ! command -v apt-get >/dev/null; then
         warn "no apt-get here: install a Vulkan loader, FFmpeg and Mesa's lavapipe >= $MESA_MINIMUM yourself."
     elif ! can_be_root; then
-        warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]}\`" \
+        warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]} python3-venv\`" \
             "(mesa-vulkan-drivers >= $MESA_MINIMUM; Debian 12 has it in its backports); going on without."
     else
         install_system
