@@ -6,6 +6,7 @@
 set -euo pipefail
 
 PYTHON_VERSION=3.12
+PYTHON_VERSIONS="$PYTHON_VERSION 3.13" # the pins fit both
 EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
 # The first Mesa whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device.
 MESA_MINIMUM=24.3
@@ -16,6 +17,15 @@ UV_HOME=.venv-uv
 say() { printf 'setup: %s\n' "$*"; }
 warn() { printf 'setup: warning: %s\n' "$*" >&2; }
 die() { printf 'setup: error: %s\n' "$*" >&2; exit 1; }
+
+# The machines for which SAPIEN, PyTorch and OpenVINO all have wheels.
+check_machine() {
+    case "$(uname -sm)" in
+        "Linux x86_64") ;;
+        "Darwin arm64") warn "this was never tried on macOS; going on." ;;
+        *) die "this needs x86-64 Linux: SAPIEN, PyTorch or OpenVINO has no wheel for $(uname -sm)." ;;
+    esac
+}
 
 # --- system packages -------------------------------------------------------------------------------------------
 
@@ -136,7 +146,7 @@ setup_system() {
     if ! command -v apt-get >/dev/null; then
         warn "no apt-get here: install a Vulkan loader, FFmpeg and Mesa's lavapipe >= $MESA_MINIMUM yourself."
     elif ! can_be_root; then
-        warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]}\`" \
+        warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]} python3-venv\`" \
             "(mesa-vulkan-drivers >= $MESA_MINIMUM; Debian 12 has it in its backports); going on without."
     else
         install_system
@@ -167,26 +177,31 @@ setup_browser() {
 
 # Only running it tells: a pyenv shim named python3.12 can be on PATH and have no Python behind it.
 is_right_python() {
-    "$1" -c "import sys; assert '%d.%d' % sys.version_info[:2] == '$PYTHON_VERSION'" >/dev/null 2>&1
+    "$1" -c "import sys; assert '%d.%d' % sys.version_info[:2] in '$PYTHON_VERSIONS'.split()" >/dev/null 2>&1
 }
 
 runs_python3() { "$1" -c 'import sys; assert sys.version_info >= (3, 8)' >/dev/null 2>&1; }
 
 local_pythons() {
-    type -aP "python$PYTHON_VERSION" python3 || true
-    compgen -G "${PYENV_ROOT:-$HOME/.pyenv}/versions/$PYTHON_VERSION.*/bin/python" || true
+    local version
+    for version in $PYTHON_VERSIONS; do
+        type -aP "python$version" || true
+        compgen -G "${PYENV_ROOT:-$HOME/.pyenv}/versions/$version.*/bin/python" || true
+    done
+    type -aP python3 || true
 }
 
 find_python() {
-    local candidate
+    local candidate said
     while read -r candidate; do
         is_right_python "$candidate" && { echo "$candidate"; return; }
     done < <(local_pythons)
     say "no working Python $PYTHON_VERSION here; asking uv for one" >&2
-    "$UV" python install "$PYTHON_VERSION" >&2 || true
+    said=$("$UV" python install "$PYTHON_VERSION" 2>&1) || true
     candidate=$("$UV" python find --python-preference only-managed "$PYTHON_VERSION" 2>/dev/null) && is_right_python "$candidate" &&
         { echo "$candidate"; return; }
-    return 1
+    die "no Python ${PYTHON_VERSIONS// / or } here, and uv could not download one (${said##*: });" \
+        "install one, by pyenv or conda perhaps, so that python$PYTHON_VERSION is on PATH, and run this again."
 }
 
 # --- uv --------------------------------------------------------------------------------------------------------
@@ -239,12 +254,22 @@ assert distribution("lerobot_env_constructskill").metadata["Name"] == "lerobot_e
 PYTHON
 }
 
+# torchcodec wants Python's shared library, which Debian and Ubuntu keep in a package of its own.
+setup_libpython() {
+    local package
+    package=$(.venv/bin/python -c 'import sysconfig; print("libpython" + sysconfig.get_python_version())')
+    .venv/bin/python -c "import ctypes; ctypes.CDLL('$package.so.1.0')" 2>/dev/null && return 0
+    say "installing $package, for torchcodec"
+    { command -v apt-get >/dev/null && can_be_root && apt_install "$package"; } ||
+        warn "no $package to be had; LeRobot decodes video with PyAV instead of torchcodec."
+}
+
 setup_venv() {
     local python
     venv_is_ready && return 0
     find_uv || install_uv
     if ! is_right_python .venv/bin/python; then
-        python=$(find_python) || die "Python $PYTHON_VERSION is neither here nor to be downloaded; install it and run this again."
+        python=$(find_python)
         say "making .venv/ with $python"
         "$UV" venv --quiet --clear --python "$python" .venv
     fi
@@ -252,6 +277,7 @@ setup_venv() {
     "$UV" pip install --quiet --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]" ||
         die "the packages could not be installed; see the lines above."
     check_name
+    setup_libpython
     fingerprint >"$STAMP"
 }
 
@@ -259,12 +285,12 @@ renew_pins() {
     local python extras
     read -r -a extras <<<"--extra ${EXTRAS//,/ --extra }"
     find_uv || install_uv
-    python=$(find_python) || die "Python $PYTHON_VERSION is neither here nor to be downloaded; install it and run this again."
+    python=$(find_python)
     {
         echo "# Every package of .venv/ at the version it was tested with, for x86-64 Linux and Python $PYTHON_VERSION."
         echo "# Written by \`make pins\`, which resolves pyproject.toml afresh."
-        "$UV" pip compile pyproject.toml --quiet --upgrade --python "$python" --no-header --no-annotate \
-            "${extras[@]}"
+        "$UV" pip compile pyproject.toml --quiet --upgrade --python "$python" --python-version "$PYTHON_VERSION" \
+            --no-header --no-annotate "${extras[@]}"
     } >constraints.txt.new
     mv constraints.txt.new constraints.txt
     say "constraints.txt renewed; run \`make test\` before you keep it."
@@ -272,6 +298,7 @@ renew_pins() {
 
 main() {
     cd "$(dirname "${BASH_SOURCE[0]}")"
+    check_machine
     case "${1:-setup}" in
         setup)
             setup_system

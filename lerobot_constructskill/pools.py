@@ -13,6 +13,11 @@ from lerobot_constructskill.errors import InputError, MachineError
 type Submit = Callable[..., Future]
 
 
+def cores() -> int:
+    """How many cores this process may use: a container or `taskset` can hold it to fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def open_pool(executor: str, workers: int) -> Iterator[Submit]:
     """Yield `submit(function, *arguments) -> Future`; leaving waits for what still runs.

@@ -1,6 +1,5 @@
 """The doctor's judgements on made-up machines, and the functions of setup.sh on made-up files."""
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,7 +21,8 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
     [
         (checks.judge_python((3, 12)), Level.OK),
         (checks.judge_python((3, 11)), Level.FAIL),
-        (checks.judge_python((3, 13)), Level.WARN),
+        (checks.judge_python((3, 13)), Level.OK),
+        (checks.judge_python((3, 14)), Level.WARN),
         (checks.judge_name(["numpy", "lerobot_env_constructskill"]), Level.OK),
         (checks.judge_name(["lerobot-env-constructskill"]), Level.FAIL),
         (checks.judge_name([]), Level.FAIL),
@@ -63,6 +63,7 @@ def test_complaints_name_their_cause() -> None:
     assert "opencv-python and opencv-python-headless" in checks.judge_opencv(checks.OPENCV[:2]).message
     assert "lerobot is 0.5 (needs <0.7,>=0.6.1)" in checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
+    assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb", "")).message
 
 
@@ -84,10 +85,9 @@ def shell(snippet: str, *arguments: str | Path) -> subprocess.CompletedProcess[s
     return subprocess.run(["bash", "-c", code, "bash", *map(str, arguments)], capture_output=True, text=True)
 
 
-def test_setup_and_doctor_want_the_same_mesa() -> None:
-    minimum = re.search(r"^MESA_MINIMUM=(.*)$", (REPOSITORY / "setup.sh").read_text(), re.MULTILINE)
-    assert minimum is not None
-    assert minimum[1] == ".".join(map(str, checks.MESA_MINIMUM))
+def test_setup_and_doctor_want_the_same_mesa_and_pythons() -> None:
+    wanted = shell('echo "$MESA_MINIMUM $PYTHON_VERSIONS"').stdout.split()
+    assert wanted == [".".join(map(str, version)) for version in (checks.MESA_MINIMUM, *checks.PYTHONS)]
 
 
 DEB822 = """\
@@ -149,6 +149,22 @@ def test_setup_judges_mesa(version: str, good: bool) -> None:
     assert (shell('new_enough "$1"', version).returncode == 0) is good
 
 
+@pytest.mark.parametrize(
+    ("machine", "refused", "said"),
+    [
+        ("Linux x86_64", False, ""),
+        ("Darwin arm64", False, "never tried on macOS"),
+        ("Linux aarch64", True, "no wheel for Linux aarch64"),
+        ("Darwin x86_64", True, "no wheel for Darwin x86_64"),
+    ],
+)
+def test_setup_refuses_a_machine_without_wheels(machine: str, refused: bool, said: str) -> None:
+    checked = shell('machine=$1; uname() { echo "$machine"; }; check_machine', machine)
+    assert (checked.returncode != 0) is refused
+    assert said in checked.stderr
+    assert len(checked.stderr.splitlines()) == bool(said)
+
+
 def test_setup_passes_over_a_python_that_does_not_run(tmp_path: Path) -> None:
     shim = tmp_path / "python3.12"
     shim.write_text("#!/bin/sh\necho 'python3.12: command not found' >&2\nexit 127\n")
@@ -157,3 +173,25 @@ def test_setup_passes_over_a_python_that_does_not_run(tmp_path: Path) -> None:
     working = Path(sys.executable).with_name("python3.12")
     found = shell('PATH="$1:$2:$PATH" find_python', tmp_path, working.parent)
     assert found.stdout.strip() == str(working)
+
+
+@pytest.mark.parametrize(
+    ("versions", "taken"), [(("3.11", "3.12", "3.13"), "3.12"), (("3.11", "3.13"), "3.13"), (("3.11",), None)]
+)
+def test_setup_takes_python_3_12_then_3_13_then_what_uv_has(
+    tmp_path: Path, versions: tuple[str, ...], taken: str | None
+) -> None:
+    (tmp_path / "uv").write_text(
+        "#!/bin/sh\nprintf 'error: not installed\n  cause: request: no network\n' >&2\nexit 1\n"
+    )
+    for version in versions:
+        (tmp_path / f"python{version}").write_text(f"#!/bin/sh\ncase $2 in *{version}*) ;; *) exit 1 ;; esac\n")
+    for program in tmp_path.iterdir():
+        program.chmod(0o755)
+    found = shell("UV=$1/uv PATH=$1 PYENV_ROOT=$1; find_python", tmp_path)
+    if taken:
+        assert found.stdout.strip() == str(tmp_path / f"python{taken}")
+    else:
+        *_, last = found.stderr.splitlines()
+        assert found.returncode != 0
+        assert "no Python 3.12 or 3.13 here" in last and "(no network)" in last

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 DISTRIBUTION = "lerobot_env_constructskill"
-PYTHON = (3, 12)
+PYTHONS = ((3, 12), (3, 13))
+"""Those that `make setup` takes, for which every pinned package has a wheel."""
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
@@ -44,10 +45,10 @@ class Probe:
 
 def judge_python(version: tuple[int, int]) -> Finding:
     text = ".".join(map(str, version))
-    if version < PYTHON:
+    if version < PYTHONS[0]:
         return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12; run `make setup`.")
-    if version > PYTHON:
-        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 this was tested with.")
+    if version not in PYTHONS:
+        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 and 3.13 this was tested with.")
     return Finding(Level.OK, "Python", text)
 
 
@@ -103,11 +104,15 @@ def judge_opencv(names: Sequence[str]) -> Finding:
 def judge_mesa(version: str | None, gpu: bool) -> Finding:
     """Judge Debian's version of mesa-vulkan-drivers; None where it is not installed or not known."""
     if gpu:
-        return Finding(Level.OK, "Mesa", "not needed: there is an NVIDIA GPU")
+        return Finding(Level.OK, "Mesa", "not needed where the NVIDIA GPU renders: see Vulkan")
     wanted = ".".join(map(str, MESA_MINIMUM))
     numbers = re.match(r"(?:\d+:)?(\d+)\.(\d+)", version or "")
     if numbers is None:
-        return Finding(Level.WARN, "Mesa", f"no package mesa-vulkan-drivers found; run `make setup` (>= {wanted}).")
+        return Finding(
+            Level.WARN,
+            "Mesa",
+            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, run `make setup` (>= {wanted}).",
+        )
     if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
         return Finding(
             Level.FAIL,
@@ -144,8 +149,10 @@ def judge_plugin(probe: Probe) -> Finding:
 def judge_ffmpeg(probe: Probe) -> Finding:
     if probe.ok:
         return Finding(Level.OK, "FFmpeg", "torchcodec loads its shared libraries")
+    package = re.search(r"libpython\d\.\d+", probe.reason)
+    missing = package[0] if package else "ffmpeg"
     return Finding(
-        Level.WARN, "FFmpeg", "torchcodec cannot load it, LeRobot decodes with PyAV; apt-get install ffmpeg."
+        Level.WARN, "FFmpeg", f"torchcodec finds no {missing}, LeRobot decodes with PyAV; apt-get install {missing}."
     )
 
 

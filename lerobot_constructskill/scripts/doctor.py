@@ -25,13 +25,16 @@ from lerobot_constructskill.scripts.checks import (
 )
 from lerobot_constructskill.scripts.console import EPILOG, edge
 
-PROBE_TIMEOUT_S = 180
+PROBE_TIMEOUT_S = 600  # importing LeRobot took 3 minutes on one core of a busy machine
 
+# The choice of `best_render_backend`, without ManiSkill.
 RENDER = """
 import sapien
 try:
     device = sapien.Device("cuda")
 except RuntimeError:
+    device = None
+if device is None or not device.can_render():
     device = sapien.Device("cpu")
 sapien.render.RenderSystem(device)
 print(device.name)
@@ -45,7 +48,15 @@ from lerobot.envs.configs import EnvConfig
 print("frozen_vit" in PreTrainedConfig.get_known_choices(), "constructskill" in EnvConfig.get_known_choices())
 """
 
-DECODE = "from torchcodec.decoders import VideoDecoder"
+# torchcodec's own complaint names every FFmpeg that is not here, and not the Python library that may be missing.
+DECODE = """
+import ctypes, sysconfig
+try:
+    from torchcodec.decoders import VideoDecoder
+except RuntimeError:
+    ctypes.CDLL(f"libpython{sysconfig.get_python_version()}.so.1.0")
+    raise
+"""
 
 # Asks whether the weights are there, not for the weights: those of all backbones together are 0.5 GB.
 FIND_WEIGHTS = """
@@ -63,7 +74,7 @@ def probe(code: str) -> Probe:
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False
         )
     except subprocess.TimeoutExpired:
-        return Probe(False, "", f"no answer within {PROBE_TIMEOUT_S} s")
+        return Probe(False, "", f"no answer within {PROBE_TIMEOUT_S} s; is this machine busy?")
     complaint = (done.stderr.strip().splitlines() or [""])[-1]
     if done.returncode < 0:
         complaint = f"the process died of signal {-done.returncode}"

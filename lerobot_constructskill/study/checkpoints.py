@@ -2,7 +2,6 @@
 
 import json
 import logging
-import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.errors import UserError, full_traceback
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.pools import cores
 from lerobot_constructskill.staging import staged
 from lerobot_constructskill.study.plan import Run, StudyPlan, Training
 from lerobot_constructskill.study.prepare import Store
@@ -175,7 +175,7 @@ def _train_stock(job: Job, run: Run, dataset: LeRobotDataset, policy: dict[str, 
             f"--steps={steps}",
             f"--save_freq={steps}",
             "--env_eval_freq=0",
-            f"--num_workers={min((os.cpu_count() or 1) - 1, LOADERS)}",
+            f"--num_workers={min(cores() - 1, LOADERS)}",
             f"--seed={run.seed}",
             f"--output_dir={folder}",
         ]

@@ -12,6 +12,7 @@ import numpy as np
 
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError, full_traceback
+from lerobot_constructskill.pools import cores
 
 PRELOADED = ["lerobot_constructskill.sim.register", "lerobot_constructskill.study.simulators"]
 """Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
@@ -67,7 +68,7 @@ def simulators(count: int, env_kwargs: Mapping[str, Any], n_workers: int | None 
     """Open `count` environments of `ConstructSkillEnv(**env_kwargs)` in `n_workers` processes (one per core)."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
-    n_workers = min(count, n_workers or os.cpu_count() or 1)
+    n_workers = min(count, n_workers or cores())
     processes, connections = [], []
     try:
         for _ in range(n_workers):
