@@ -1,6 +1,9 @@
 .DEFAULT_GOAL := help
 .PHONY: help setup demo ten-seeds test check bench pins
 
+# Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
+export PYTHONDONTWRITEBYTECODE :=
+
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
 PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile
 

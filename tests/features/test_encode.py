@@ -25,6 +25,7 @@ from lerobot_constructskill.staging import MARK
 
 KEY = "observation.features.base"
 LENGTHS = (5, 3)
+STORED = pytest.mark.parametrize("source", ["video", "image"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +33,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("encode")
 
 
-@pytest.fixture(scope="module", params=["video", "image"])
-def source(request: pytest.FixtureRequest, folder: Path) -> LeRobotDataset:
-    image = {"dtype": request.param, "shape": (64, 96, 3), "names": ["height", "width", "channels"]}
+@pytest.fixture(scope="module")
+def source(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> LeRobotDataset:
+    """Two short episodes: a video unless a test asks for images."""
+    dtype = getattr(request, "param", "video")
+    image = {"dtype": dtype, "shape": (64, 96, 3), "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         "local/source",
         fps=20,
-        root=folder / f"source_{request.param}",
+        root=tmp_path_factory.mktemp(dtype) / "source",
         features={
             "observation.images.base": image,
             "observation.images.wrist": image,
@@ -102,6 +105,7 @@ def policy_config(weights: Path, **fields: object) -> FrozenViTChunkConfig:
     return FrozenViTChunkConfig(device="cpu", **fields)
 
 
+@STORED
 def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encoded):
     assert {name for name in encoded.meta.features if "." in name} == {"observation.state", KEY}
     assert not encoded.meta.camera_keys and not list(encoded.root.rglob("*.mp4"))
@@ -118,6 +122,7 @@ def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encod
     assert encoded.meta.stats[KEY]["mean"].shape == (192,)
 
 
+@STORED
 def test_features_are_the_policys_own_at_every_frame(source, encoded, weights):
     policy = make_policy(policy_config(weights), ds_meta=source.meta)
     for before, after in zip(source, encoded, strict=True):

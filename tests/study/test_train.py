@@ -1,5 +1,7 @@
 """Seeds trained together are the seeds trained alone, and end as LeRobot checkpoints."""
 
+from functools import cache
+
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
@@ -23,19 +25,18 @@ FIELDS = [
 ]
 
 
-def chunked(dataset, policy):
-    return LeRobotDataset(
-        dataset.repo_id,
-        root=dataset.root,
-        delta_timestamps={"action": [i / dataset.fps for i in policy.config.action_delta_indices]},
-    )
+@cache
+def chunked(dataset, chunk_size):
+    """Items of LeRobot's own loader, read once for all variants."""
+    chunks = {"action": [i / dataset.fps for i in range(chunk_size)]}
+    return list(LeRobotDataset(dataset.repo_id, root=dataset.root, delta_timestamps=chunks))
 
 
 def train_alone(config, dataset, seed, training):
     """One seed as a plain loop over LeRobot's own loader items, `policy.forward`, AdamW and gradient clipping."""
     torch.manual_seed(seed)
     policy = make_policy(config, ds_meta=dataset.meta).train()
-    items = chunked(dataset, policy)
+    items = chunked(dataset, config.chunk_size)
     preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats)
     preset = policy.config.get_optimizer_preset()
     optimizer = preset.build(policy.get_optim_params())
@@ -84,7 +85,7 @@ def test_the_held_out_error_is_that_of_every_fourth_episode(validation, fields, 
     policies = train_seeds(config(**fields), feature_set, [0], TRAINING)
     dataset, stats = request.getfixturevalue(validation), feature_set.meta.stats
     (measured,) = heldout_mse(policies, dataset, TRAINING.holdout, stats)
-    items = [item for item in chunked(dataset, policies[0]) if int(item["episode_index"]) in (3, 7)]
+    items = [item for item in chunked(dataset, policies[0].config.chunk_size) if int(item["episode_index"]) in (3, 7)]
     preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=stats)
     batch = preprocess(torch.utils.data.default_collate(items))
     policies[0].patches_root = dataset.root
