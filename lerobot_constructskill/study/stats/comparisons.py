@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import quad
 from scipy.stats import beta, boschloo_exact, fisher_exact
+from statsmodels.stats.multitest import multipletests
 
 from lerobot_constructskill.study.stats.intervals import Estimate, newcombe
 from lerobot_constructskill.study.stats.outcomes import Counts
@@ -67,11 +68,11 @@ def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
         p_values: of the comparisons that could be made.
         family: how many were declared; the missing ones count as p = 1.
     """
-    values = np.asarray(p_values, dtype=float)
-    order, family = np.argsort(values), family or len(values)
-    corrected = np.empty_like(values)
-    corrected[order] = np.maximum.accumulate((family - np.arange(len(values))) * values[order])
-    return np.minimum(corrected, 1.0).tolist()
+    missing = (family or len(p_values)) - len(p_values)
+    if not p_values:
+        return []
+    corrected = multipletests([*p_values, *[1.0] * missing], method="holm")[1]
+    return [float(p_value) for p_value in corrected[: len(p_values)]]
 
 
 def probability_better(a: Counts, b: Counts) -> float:
