@@ -5,7 +5,7 @@
 export PYTHONDONTWRITEBYTECODE :=
 
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
-PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile
+PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=20
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
