@@ -11,6 +11,9 @@ PYTHONS = ((3, 12), (3, 13))
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
+DEMO_FRAMES = 8_623
+"""What `configs/generate/fast_shifted_wrist.yaml` makes, and `make demo` encodes."""
+
 OPENCV = (
     "opencv-python",
     "opencv-python-headless",
@@ -169,3 +172,17 @@ def judge_weights(probe: Probe) -> Finding:
     if not found:
         return Finding(Level.FAIL, "Weights", f"none for {missing}; {remedy}")
     return Finding(Level.WARN, "Weights", f"{found}, but none for {missing}; {remedy}")
+
+
+def judge_encoder(probe: Probe) -> Finding:
+    """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
+    if not probe.ok:
+        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); run `make setup`.")
+    precision, runtime, device, speed = probe.out.split()
+    expected = (
+        f"backbone_precision=auto is {precision} here, {float(speed):.0f} images/s of dinov2_vits14 by {runtime} on "
+        f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for the frames of `make demo`"
+    )
+    if (runtime, device) == ("torch", "cpu"):
+        return Finding(Level.WARN, "Encoder", f"{expected}; pip install '{DISTRIBUTION}[cpu]' to be faster.")
+    return Finding(Level.OK, "Encoder", expected)

@@ -13,6 +13,7 @@ from lerobot_constructskill.scripts.checks import (
     Finding,
     Level,
     Probe,
+    judge_encoder,
     judge_ffmpeg,
     judge_mesa,
     judge_name,
@@ -64,6 +65,22 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.weights import find_source
 for backbone in BACKBONES.values():
     print(backbone.name, find_source(backbone) or "", sep="\\t")
+"""
+
+
+# Random weights take as long as trained ones.
+ENCODE = """
+import time, torch
+from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.precision import native_precision
+device = "cuda" if torch.cuda.is_available() else "cpu"
+encoder = FrozenEncoder(get_backbone("dinov2_vits14"), native_precision(device)).to(device)
+images = torch.rand(16, 3, 224, 224)
+for _ in range(2):
+    start = time.perf_counter()
+    encoder(images.to(device)).cpu()
+print(encoder.precision, encoder.runtime, device, 16 / (time.perf_counter() - start))
 """
 
 
@@ -123,6 +140,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     lambda: judge_ffmpeg(probe(DECODE)),
     lambda: judge_plugin(probe(REGISTER)),
     lambda: judge_weights(probe(FIND_WEIGHTS)),
+    lambda: judge_encoder(probe(ENCODE)),
 )
 
 
@@ -141,8 +159,8 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="constructskill-doctor",
-        description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin and the pretrained weights "
-        "of this machine (about a minute). Exit status 1 where something fails.",
+        description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin, the pretrained weights "
+        "and the encoder's speed on this machine (about a minute). Exit status 1 where something fails.",
         epilog=EPILOG,
     )
     with edge():
