@@ -148,10 +148,11 @@ def test_a_truncated_checkpoint_is_named_in_one_sentence(trained, folder):
     assert "model.safetensors" in last and "truncated" in last
 
 
-def test_features_of_another_backbone_are_refused_in_one_sentence(features, folder):
-    flags = ["--policy.type=frozen_vit", "--policy.backbone_precision=bfloat16", *features, *SHORT]
+def test_features_of_another_encoder_are_refused_in_one_sentence(features, folder):
+    flags = ["--policy.type=frozen_vit", "--policy.crop=[0,0,0.5,1]", *features, *SHORT]
     log = call("lerobot-train", *flags, "--steps=2", f"--output_dir={folder / 'refused'}", fails=True)
-    assert "precision float32 (the policy: bfloat16)" in log.strip().splitlines()[-1]
+    last = log.strip().splitlines()[-1]
+    assert "were not made by this policy's encoder: preprocessing" in last and "crop [0.0, 0.0, 0.5, 1.0]" in last
 
 
 def test_lerobots_own_tools_read_the_data_set(demonstrations):

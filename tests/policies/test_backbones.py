@@ -13,6 +13,7 @@ from lerobot_constructskill.policies.frozen_vit import encoder as encoder_module
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
+from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_wheel, state_sha256
 
 THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
@@ -67,10 +68,15 @@ def test_bfloat16_stays_close_and_returns_float32(weights, images):
     assert torch.nn.functional.cosine_similarity(*features).min() > 0.99
 
 
-@pytest.mark.parametrize("name", BACKBONES)
-def test_openvino_encodes_an_image_alike_in_every_batch_and_as_autocast_does(name, weights, monkeypatch):
+NATIVE = [precision for precision in PRECISIONS if is_native(precision, "cpu")]
+
+
+@pytest.mark.parametrize(
+    ("name", "precision"), [*((name, NATIVE[-1]) for name in BACKBONES), ("vit_tiny16", "float32")]
+)
+def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name, precision, weights, monkeypatch):
     pytest.importorskip("openvino", reason="the extra `cpu` supplies it")
-    encoder = FrozenEncoder(BACKBONES[name], "bfloat16")
+    encoder = FrozenEncoder(BACKBONES[name], precision)
     encoder.model.load_state_dict(load_weights(BACKBONES[name], str(weights(name)))[0])
     images = torch.rand(3, 3, 224, 224, generator=torch.Generator().manual_seed(0))
     together, patches = encoder.encode(images)
@@ -78,13 +84,13 @@ def test_openvino_encodes_an_image_alike_in_every_batch_and_as_autocast_does(nam
     assert torch.equal(together, torch.cat([encoder(image[None]) for image in images]))
     monkeypatch.setattr(encoder_module.openvino, "is_installed", lambda: False)
     assert encoder.runtime == "torch"
-    for ours, autocast in zip((together, patches), encoder.encode(images), strict=True):
-        assert (ours - autocast).norm() < 0.02 * autocast.norm()
+    for ours, eager in zip((together, patches), encoder.encode(images), strict=True):
+        assert (ours - eager).norm() < {"bfloat16": 0.02, "float32": 1e-5}[precision] * eager.norm()
 
 
 def test_weights_loaded_after_the_first_image_are_the_ones_used(weights, images):
     spec = BACKBONES["vit_tiny16"]
-    encoder = FrozenEncoder(spec, "bfloat16")
+    encoder = FrozenEncoder(spec, NATIVE[-1])
     features = []
     for seed in (0, 1, 0):
         encoder.model.load_state_dict(load_weights(spec, str(weights("vit_tiny16", seed)))[0])
