@@ -50,12 +50,14 @@ def study(config: StudyConfig) -> str:
         ValueError: the folder holds another plan's results, or not one run succeeded.
     """
     import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.study.checkpoints import settle_precision
     from lerobot_constructskill.study.prepare import Store
     from lerobot_constructskill.study.run import Options, run_study
 
     root = config.root or Path("outputs/study") / config.name
     options = Options(config.together, config.executor, config.workers, config.retry_failed)
-    rows = run_study(config.plan, root.absolute(), Store(config.data_root.absolute(), config.workers), options)
+    plan, store = settle_precision(config.plan), Store(config.data_root.absolute(), config.workers)
+    rows = run_study(plan, root.absolute(), store, options)
     runs = rows.groupby(["setting", "variant", "training_seed"])["error"].first()
     if runs.notna().all():
         why = f"their tracebacks are in {root / 'logs'}; the first: {runs.iloc[0]}"

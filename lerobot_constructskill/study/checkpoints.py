@@ -11,14 +11,16 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.device_utils import auto_select_torch_device
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.errors import UserError, full_traceback
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.precision import AUTO, resolve_precision
 from lerobot_constructskill.pools import cores
 from lerobot_constructskill.staging import staged
-from lerobot_constructskill.study.plan import Run, StudyPlan, Training
+from lerobot_constructskill.study.plan import Run, StudyPlan, Training, Variant
 from lerobot_constructskill.study.prepare import Store
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
@@ -78,6 +80,20 @@ class Job:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("a") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{full_traceback(error)}\n")
+
+
+def settle_precision(plan: StudyPlan) -> StudyPlan:
+    """The plan with `backbone_precision: auto` as what it means here, so that no study mixes two kinds of CPU."""
+    return replace(plan, variants={name: _settled(variant) for name, variant in plan.variants.items()})
+
+
+def _settled(variant: Variant) -> Variant:
+    policy = variant.policy
+    if policy["type"] != "frozen_vit":
+        return variant
+    device = policy.get("device") or auto_select_torch_device()
+    precision = resolve_precision(policy.get("backbone_precision", AUTO), device)
+    return replace(variant, policy=policy | {"backbone_precision": precision})
 
 
 def demonstrations(job: Job, data: str | None = None) -> LeRobotDataset:
