@@ -12,6 +12,7 @@ from measure import OUT, report
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE
 from lerobot_constructskill.policies.frozen_vit.openvino import OpenVINOEncoder, Traceable
+from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
 
 BATCH, ROUNDS = 16, 5
 TARGET = 2
@@ -26,14 +27,14 @@ def candidates(encoder, pixels):
         with torch.autocast("cpu", dtype=torch.bfloat16):
             return function(model, pixels)[0].float()
 
-    ours = OpenVINOEncoder(model, encode, IMAGE_SIZE)
+    ours = {p: OpenVINOEncoder(model, encode, IMAGE_SIZE, p) for p in PRECISIONS if is_native(p, "cpu")}
     return {
         "PyTorch float32 eager": lambda: encode(model, pixels)[0],
         "PyTorch bfloat16 autocast": lambda: autocast(encode),
         "torch.compile bfloat16 autocast": lambda: autocast(compiled),
         "ONNX Runtime float32": onnx_runtime(encoder, pixels),
-        "OpenVINO float32": openvino_float32(encoder, pixels),
-        "OpenVINO bfloat16 (ours)": lambda: ours(pixels)[0],
+        "OpenVINO float32, the batch at once": openvino_float32(encoder, pixels),
+        **{f"OpenVINO {p} (ours)": lambda own=own: own(pixels)[0] for p, own in ours.items()},
     }
 
 

