@@ -34,7 +34,7 @@ main()
 @pytest.mark.sim
 @pytest.mark.slow
 def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypatch):
-    monkeypatch.setattr(shards, "ConstructSkillEnv", ToyEnv)
+    monkeypatch.setattr(shards, "_environment", ToyEnv)
     root, evaluations = tmp_path / "set", tmp_path / "eval"
     record(GenerateConfig("local/toy", str(root), episodes=2, obs_type="pixels_agent_pos"))
     with serve() as hub:
