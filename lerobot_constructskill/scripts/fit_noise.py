@@ -21,6 +21,7 @@ class FitNoiseConfig:
     episodes: list[int] | None = None  # held-out episodes; every eighth when left out
     alpha: float | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
     device: str | None = None  # default: a GPU where there is one
+    backbone_precision: str | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
 
 
 def fit_noise(config: FitNoiseConfig) -> str:
@@ -46,7 +47,8 @@ def fit_noise(config: FitNoiseConfig) -> str:
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
         raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
     with one_sentence(config.policy_path):
-        agent = PolicyAgent.from_pretrained(config.policy_path, config.device or str(auto_select_torch_device()))
+        device = config.device or str(auto_select_torch_device())
+        agent = PolicyAgent.from_pretrained(config.policy_path, device, config.backbone_precision)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
     bar = Progress(episodes, "demonstrations", unit="demo")
     errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]

@@ -26,10 +26,14 @@ class OfflineConfig:
     batch_size: int = 32  # frames at a time
     seed: int = 0  # of policies that sample their actions
     device: str | None = None  # default: that of the checkpoint
+    backbone_precision: str | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
 
 
 SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
 """Columns that are printed; the files have all."""
+
+PRECISION = ("backbone_precision", "backbone_trained_precision")
+"""What frozen_vit's encoder computed in, and in training; they differ where a checkpoint crossed over."""
 
 TYPES = {
     "training_seed": "Int64",
@@ -84,7 +88,7 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
     from lerobot_constructskill.study.agents import PolicyAgent
     from lerobot_constructskill.study.offline import observed, offline_metrics, predict
 
-    agent = PolicyAgent.from_pretrained(checkpoint, config.device)
+    agent = PolicyAgent.from_pretrained(checkpoint, config.device, config.backbone_precision)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
@@ -93,6 +97,7 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
         "policy": agent.policy.name,
         "training_seed": _training_seed(checkpoint),
         **asdict(metrics),
+        **{name: getattr(agent.policy.config, name, None) for name in PRECISION},
         "checkpoint": str(checkpoint),
         "weights_sha256": file_sha256(checkpoint / "model.safetensors"),
     }

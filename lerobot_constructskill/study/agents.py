@@ -64,15 +64,21 @@ class PolicyAgent:
         self.encoder = policy.backbone if isinstance(policy, FrozenViTChunkPolicy) else None
 
     @classmethod
-    def from_pretrained(cls, checkpoint: Path | str, device: str | None = None) -> "PolicyAgent":
+    def from_pretrained(
+        cls, checkpoint: Path | str, device: str | None = None, backbone_precision: str | None = None
+    ) -> "PolicyAgent":
         """Load a checkpoint folder, or a name on the Hub, of any registered policy type.
+
+        Args:
+            backbone_precision: of frozen_vit, in place of the one that the checkpoint was trained in.
 
         Raises:
             ValueError: its configuration cannot be read, or is of an unknown type.
             OSError: there is no such checkpoint.
         """
         with as_input():
-            config = PreTrainedConfig.from_pretrained(checkpoint)
+            crossing = [f"--backbone_precision={backbone_precision}"] if backbone_precision else []
+            config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=crossing)
         config.device = device or config.device
         config.pretrained_path = checkpoint
         with redirect_stdout(StringIO()):  # LeRobot prints where it loads weights from, for every policy
