@@ -7,6 +7,8 @@ cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH"
 OUT="${OUT:-outputs/shifted}" SEEDS="${SEEDS:-0}"
 
+trap 'kill $(jobs -p) 2>/dev/null || true' EXIT # what is interrupted leaves nothing running
+
 say() { printf '\n\033[1m== %d:%02d  %s\033[0m\n' $((SECONDS / 60)) $((SECONDS % 60)) "$*"; }
 
 # Run a command of LeRobot's: its log goes to a file, its newest progress bar to the screen.
