@@ -37,7 +37,8 @@ for seed in $SEEDS; do
     if [ ! -e "$train/checkpoints/last" ]; then
         say "Training seed $seed: lerobot-train, 12 passes over 70 demonstrations"
         rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
-        with_bar "$OUT/train_$seed.log" lerobot-train --config_path=configs/train/frozen_vit_keypoints.yaml \
+        # One thread: more would stall the two processes that load, on a machine with few cores.
+        OMP_NUM_THREADS=1 with_bar "$OUT/train_$seed.log" lerobot-train --config_path=configs/train/frozen_vit_keypoints.yaml \
             --dataset.root="$OUT/features" --seed="$seed" --output_dir="$train"
     fi
     if [ ! -e "$eval/eval_info.json" ]; then
