@@ -5,6 +5,7 @@ from lerobot.datasets import LeRobotDataset
 from measure import OUT, report
 
 from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.policies.frozen_vit.precision import native_precision
 from lerobot_constructskill.study.agents import PolicyAgent
 
 FRAMES = 200
@@ -12,10 +13,13 @@ FRAMES = 200
 
 @torch.inference_mode()
 def main() -> None:
+    if native_precision() != "bfloat16":
+        print("this CPU would emulate bfloat16, which nothing here then uses")
+        return
     dataset = LeRobotDataset("local/fast", root=OUT / "demonstrations")
     rows = torch.linspace(0, len(dataset) - 1, FRAMES).long()
     images = torch.stack([dataset[int(row)]["observation.images.base"] for row in rows])
-    exact = torch.cat([load_encoder("dinov2_vits14")[0](batch) for batch in images.split(16)])
+    exact = load_encoder("dinov2_vits14", precision="float32")[0](images)
     low = load_encoder("dinov2_vits14", precision="bfloat16")[0](images)
     policies = [PolicyAgent.from_pretrained(path, "cpu").policy for path in sorted((OUT / "checkpoints").iterdir())]
     chunks = [[p.predict_action_chunk({p.config.feature_key: f})[:, 0] for f in (exact, low)] for p in policies]

@@ -12,7 +12,12 @@ VIDEO_STEPS = 12
 SEEDS = 10
 STOCK_RUNS = 2
 
-VIDEO = ["--policy.type=frozen_vit", "--dataset.repo_id=local/fast", f"--dataset.root={OUT}/demonstrations"]
+VIDEO = [
+    "--policy.type=frozen_vit",
+    "--dataset.repo_id=local/fast",
+    f"--dataset.root={OUT}/demonstrations",
+    "--policy.backbone_precision=float32",
+]
 FEATURES = ["--config_path=configs/train/frozen_vit_fast.yaml", f"--dataset.root={OUT}/features"]
 COMMON = ["--policy.push_to_hub=false", "--policy.save_backbone=false", "--env_eval_freq=0", "--log_freq=1"]
 
