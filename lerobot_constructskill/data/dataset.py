@@ -98,8 +98,7 @@ def open_dataset(root: Path) -> DataSet:
         FileNotFoundError: there is no data set at `root`.
         ValueError: a file that cannot be read, or that lacks what every data set has; the message names it.
     """
-    if not (root / "meta" / "info.json").is_file():
-        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
+    check_is_there(root)
     tasks = _tables(root, "meta/tasks.parquet").reset_index()
     data = DataSet(
         root=root,
@@ -117,6 +116,16 @@ def open_dataset(root: Path) -> DataSet:
     if missing:
         raise InputError(f"meta/episodes/ has no column {missing[0]}.")
     return data
+
+
+def check_is_there(root: Path) -> None:
+    """Refuse a folder without a data set.
+
+    Raises:
+        FileNotFoundError: meta/info.json, which every data set has, is missing.
+    """
+    if not (root / "meta" / "info.json").is_file():
+        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
 
 
 def _json(root: Path, name: str) -> Facts:

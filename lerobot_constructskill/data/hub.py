@@ -59,8 +59,10 @@ def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -
     """
     from lerobot.datasets import LeRobotDataset
 
-    if root is not None and not (root / "meta" / "info.json").is_file():
-        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
+    from lerobot_constructskill.data.dataset import check_is_there
+
+    if root is not None:
+        check_is_there(root)
     try:
         with one_sentence(repo_id, revision):
             return LeRobotDataset(repo_id, root=root, revision=revision)

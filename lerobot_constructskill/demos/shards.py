@@ -12,6 +12,7 @@ from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.staging import staged
 
 OUTCOME = "attempt.json"
@@ -69,27 +70,23 @@ def finished(folder: Path) -> dict[int, Attempt]:
 
 
 def _write_episode(config: GenerateConfig, frames: list[dict], root: Path) -> None:
-    import av
-    import datasets
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    # One progress bar is enough: these print one for every demonstration.
-    datasets.disable_progress_bars()
-    av.logging.set_libav_level(av.logging.ERROR)
     os.environ.setdefault("SVT_LOG", "1")
-    dataset = LeRobotDataset.create(
-        repo_id=config.repo_id,
-        root=root,
-        fps=FPS,
-        robot_type="panda",
-        features=demonstration_features(get_task(config.task), config.obs_type),
-        rgb_encoder=RGBEncoderConfig(crf=18),
-        streaming_encoding=True,
-        # A demonstration is written at once; a shorter queue would drop frames that the encoder is late for.
-        encoder_queue_maxsize=config.max_steps,
-    )
-    for frame in frames:
-        dataset.add_frame(frame)
-    dataset.save_episode()
-    dataset.finalize()
+    with quiet():
+        dataset = LeRobotDataset.create(
+            repo_id=config.repo_id,
+            root=root,
+            fps=FPS,
+            robot_type="panda",
+            features=demonstration_features(get_task(config.task), config.obs_type),
+            rgb_encoder=RGBEncoderConfig(crf=18),
+            streaming_encoding=True,
+            # A demonstration is written at once; a shorter queue would drop frames that the encoder is late for.
+            encoder_queue_maxsize=config.max_steps,
+        )
+        for frame in frames:
+            dataset.add_frame(frame)
+        dataset.save_episode()
+        dataset.finalize()

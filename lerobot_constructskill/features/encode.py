@@ -22,9 +22,9 @@ from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
-from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, check_native, resolve_precision
+from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
-from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.staging import replaced
 
 PARTS = "encoded"
@@ -47,8 +47,6 @@ def load_encoder(
         FileNotFoundError: no source has the weights.
     """
     spec = get_backbone(backbone)
-    if precision not in (AUTO, *PRECISIONS):
-        raise InputError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{precision}'.")
     precision = resolve_precision(precision, device)
     check_native(precision, device)
     state, source = load_weights(spec, path)
@@ -104,12 +102,11 @@ def _encode_frames(
     # Frames of an earlier run are where the bar starts, not part of its rate.
     with Progress(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
         for episode in missing:
-            pooled, tokens = [], []
+            batches = []
             for images in _batches(dataset, key, episode, batch_size):
-                some_pooled, some_tokens = _encode(encoder, images, patches)
-                pooled.append(some_pooled)
-                tokens.append(some_tokens)
+                batches.append(_encode(encoder, images, patches))
                 progress.update(len(images))
+            pooled, tokens = zip(*batches, strict=True)
             file = _part(parts, episode)
             if patches:
                 _save(file.with_suffix(PATCHES), np.concatenate(tokens))
@@ -152,7 +149,8 @@ def _write_copy(
 ) -> None:
     key = feature_key(camera)
     column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}
-    copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), folder, repo_id)
+    with quiet():
+        copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), folder, repo_id)
     stats = compute_episode_stats({key: features}, {key: column})
     write_stats({**(copy.meta.stats or {}), **stats}, folder)
     _forget_videos(folder)

@@ -12,7 +12,7 @@ from lerobot_constructskill.errors import InputError
 
 from .backbones import IMAGE_SIZE, get_backbone
 from .features import feature_key
-from .precision import AUTO, PRECISIONS
+from .precision import AUTO, PRECISIONS, check_precision
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
@@ -114,7 +114,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         super().__post_init__()
         self._feature_column: dict[str, Any] | None = None
         get_backbone(self.backbone)
-        _check_choice("backbone_precision", self.backbone_precision, (AUTO, *PRECISIONS))
+        check_precision(self.backbone_precision)
         if self.backbone_trained_precision is not None:
             _check_choice("backbone_trained_precision", self.backbone_trained_precision, PRECISIONS)
         _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)

@@ -32,8 +32,19 @@ def native_precision(device: torch.device | str = "cpu") -> str:
     return "bfloat16" if native else "float32"
 
 
+def check_precision(asked: str) -> None:
+    """Refuse what is neither `auto` nor a precision.
+
+    Raises:
+        ValueError: the message lists what there is.
+    """
+    if asked not in (AUTO, *PRECISIONS):
+        raise InputError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{asked}'.")
+
+
 def resolve_precision(asked: str, device: torch.device | str, made_in: str | None = None) -> str:
     """Return what `auto` means on a device, or for what was `made_in` one precision already; others as they are."""
+    check_precision(asked)
     return (made_in or native_precision(device)) if asked == AUTO else asked
 
 
