@@ -1,4 +1,6 @@
-"""The order of the tests."""
+"""The order of the tests, and their garbage."""
+
+import gc
 
 import pytest
 
@@ -10,3 +12,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         weight = 2 * bool(item.get_closest_marker("slow")) + bool(item.get_closest_marker("sim"))
         weights[item.path] = max(weight, weights.get(item.path, 0))
     items.sort(key=lambda item: -weights[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """What the tests import stays: the collector need not look at LeRobot's million objects again and again."""
+    gc.collect()
+    gc.freeze()
