@@ -17,7 +17,7 @@ demo: setup ## demonstrations, training, evaluation and a video, end to end
 	@examples/demo.sh
 
 ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study, with its report
-	.venv/bin/constructskill-study --config_path=configs/study/ten_seeds.yaml
+	.venv/bin/constructskill-study ten_seeds
 	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
 
 test: setup ## every test

@@ -6,7 +6,7 @@ from measure import OUT, report
 
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit.precision import native_precision
-from lerobot_constructskill.study.agents import PolicyAgent
+from lerobot_constructskill.rollout.agents import PolicyAgent
 
 FRAMES = 200
 

@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 import lerobot_constructskill.plugin  # noqa: F401
-from lerobot_constructskill.study.agents import PolicyAgent
-from lerobot_constructskill.study.rollout import roll_out
+from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.lockstep import roll_out
 
 
 def main(folder: Path, steps: int) -> None:

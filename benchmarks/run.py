@@ -30,8 +30,7 @@ def prepare() -> None:
     OUT.mkdir(parents=True, exist_ok=True)
     demonstrations, features = OUT / "demonstrations", OUT / "features"
     if not demonstrations.exists():
-        config = "--config_path=configs/generate/fast.yaml"
-        run("constructskill-generate", config, "--repo_id=local/fast", f"--root={demonstrations}")
+        run("constructskill-generate", "fast", "--repo_id=local/fast", f"--root={demonstrations}")
     if not features.exists():
         source = ["--repo_id=local/fast", f"--root={demonstrations}", f"--out_root={features}"]
         run("constructskill-encode", *source)

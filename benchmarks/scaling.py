@@ -42,7 +42,7 @@ def write_demonstrations(root, count: int) -> None:
 
 def generation(count: int) -> Ran:
     out = OUT / "scaling" / f"generated_{count}"
-    config = ["--config_path=configs/generate/fast.yaml", f"--episodes={count}", "--workers=2"]
+    config = ["fast", f"--episodes={count}", "--workers=2"]
     return run("constructskill-generate", *config, "--repo_id=local/some", f"--root={out}")
 
 

@@ -7,10 +7,11 @@ import sys
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.study.plan import Training
-from lerobot_constructskill.study.train import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 
 DINOV2 = {"standardize_features": True}  # configs/train/frozen_vit_fast.yaml
 
@@ -19,9 +20,10 @@ def main(folder: Path, n_seeds: int, batch_size: int, weights: str | None = None
     fields = {"backbone": "vit_tiny16", "backbone_path": weights} if weights else DINOV2
     config = FrozenViTChunkConfig(save_backbone=False, device="cpu", **fields)
     dataset = LeRobotDataset("local/features", root=folder / "features")
-    training = Training(epochs=10, batch_size=batch_size)
-    policies = train_seeds(config, dataset, range(n_seeds), training)
-    errors = heldout_mse(policies, dataset, training.holdout, dataset.meta.stats)
+    episodes = held_out(dataset.num_episodes)
+    policies = train_seeds(config, dataset, range(n_seeds), 10, batch_size, episodes)
+    preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=dataset.meta.stats)
+    errors = heldout_mse(policies, dataset, episodes, preprocess)
     for seed, (policy, error) in enumerate(zip(policies, errors, strict=True)):
         save_checkpoint(policy, dataset, folder / "checkpoints" / f"seed_{seed}")
         print(f"seed {seed}: held-out translation error {error:.2e} m2")

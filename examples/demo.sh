@@ -25,20 +25,21 @@ with_bar() {
 }
 
 say "Demonstrations: 80 of the brick task by the scripted expert, with noise"
-[ -d "$OUT/demonstrations" ] || constructskill-generate --config_path=configs/generate/fast_shifted_wrist.yaml \
+[ -d "$OUT/demonstrations" ] || constructskill-generate fast_shifted_wrist \
     --repo_id=local/shifted --root="$OUT/demonstrations" --workers="$(nproc)"
 
 say "Features: every frame once through the frozen DINOv2 encoder"
 [ -d "$OUT/features" ] || constructskill-encode --camera=wrist --patches=true \
     --repo_id=local/shifted --root="$OUT/demonstrations" --out_repo_id=local/shifted_dinov2 --out_root="$OUT/features"
 
+recipe=$(constructskill-config train/frozen_vit_keypoints)
 for seed in $SEEDS; do
     train="$OUT/train/seed_$seed" eval="$OUT/eval/seed_$seed"
     if [ ! -e "$train/checkpoints/last" ]; then
         say "Training seed $seed: lerobot-train, 12 passes over 70 demonstrations"
         rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
         # One thread: more would stall the two processes that load, on a machine with few cores.
-        OMP_NUM_THREADS=1 with_bar "$OUT/train_$seed.log" lerobot-train --config_path=configs/train/frozen_vit_keypoints.yaml \
+        OMP_NUM_THREADS=1 with_bar "$OUT/train_$seed.log" lerobot-train --config_path="$recipe" \
             --dataset.root="$OUT/features" --seed="$seed" --output_dir="$train"
     fi
     if [ ! -e "$eval/eval_info.json" ]; then

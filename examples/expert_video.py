@@ -20,7 +20,7 @@ def main(task: str = "brick_to_bin", folder: str = "outputs") -> None:
     env = ConstructSkillEnv(task)
     film = []
     demonstrate(
-        env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=lambda phase, obs: film.append(env.render())
+        env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START, watch=lambda phase, obs: film.append(env.render())
     )
     env.close()
     path = Path(folder) / f"{task}.mp4"

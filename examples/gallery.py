@@ -34,7 +34,7 @@ def film(task: Task) -> list[np.ndarray]:
         seen.append(obs["pixels"]["base"])
         close_ups.append(env.render())
 
-    demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
+    demonstrate(env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START, watch=keep)
     env.close()
     return [seen[0], close_ups[len(close_ups) // 2], close_ups[-1]]
 

@@ -10,6 +10,9 @@ from traceback import TracebackException
 class UserError(Exception):
     """A sentence for the user. Each kind of it is also the exception that Python's users expect there."""
 
+    kind = "input"
+    """What tables call such a failure."""
+
 
 class InputError(UserError, ValueError):
     """A value, a file or a combination of them that cannot be used."""
@@ -18,13 +21,32 @@ class InputError(UserError, ValueError):
 class MissingError(UserError, FileNotFoundError):
     """Something that was named is not there."""
 
+    kind = "missing"
+
+
+class MissingWeightsError(MissingError):
+    """No source has a backbone's weights."""
+
+    kind = "weights"
+
 
 class TakenError(UserError, FileExistsError):
     """Something is there already, or another process is making it."""
 
+    kind = "taken"
+
 
 class MachineError(UserError, OSError):
     """This machine, its network or the Hub does not do its part."""
+
+    kind = "machine"
+
+
+def kind_of(error: BaseException) -> str:
+    """What tables call a failure: a `UserError`'s kind, "machine" for the operating system's, or "fault"."""
+    if isinstance(error, UserError):
+        return error.kind
+    return "machine" if isinstance(error, OSError) else "fault"
 
 
 def full_traceback(error: BaseException) -> str:

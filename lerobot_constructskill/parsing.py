@@ -11,6 +11,8 @@ from draccus.argparsing import ArgumentParser
 
 from lerobot_constructskill.errors import InputError
 
+OURS = Path(__file__).parent
+
 
 def parse[Config](
     config_class: type[Config],
@@ -51,6 +53,7 @@ def as_input() -> Iterator[None]:
         root = error
         while root.__cause__ is not None:
             root = root.__cause__
-        if any(frame.name == "__post_init__" for frame in traceback.extract_tb(root.__traceback__)):
+        refusals = [frame for frame in traceback.extract_tb(root.__traceback__) if frame.name == "__post_init__"]
+        if refusals and Path(refusals[-1].filename).is_relative_to(OURS):
             raise root from None  # a configuration of ours, which refuses the values or is broken itself
         raise InputError(str(error if isinstance(error, draccus.utils.DecodingError) else root)) from error

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 
 import pytest
-import yaml
 from commands import QUICK, call
 from tokenizers import Tokenizer
 from tokenizers.models import WordLevel
@@ -115,7 +114,7 @@ def trained(request, folder, demonstrations):
 
 def test_a_policy_trains_on_the_data_set_is_saved_and_runs_in_the_environment(trained, folder):
     kind, checkpoint = trained
-    renames = yaml.safe_load((CONFIGS / f"{kind}.yaml").read_text()).get("rename_map", {})
+    renames = json.loads((checkpoint / "train_config.json").read_text())["rename_map"]
     env = ["--env.type=constructskill", "--env.obs_type=pixels_agent_pos", "--env.episode_length=6"]
     one = ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={folder / 'eval' / kind}"]
     call("lerobot-eval", f"--policy.path={checkpoint}", f"--rename_map={json.dumps(renames)}", *env, *one)

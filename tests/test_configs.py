@@ -1,8 +1,8 @@
 """Every shipped YAML is read by the class it is for, and says what it claims to say."""
 
 import math
-import re
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import draccus
@@ -13,17 +13,20 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 import lerobot_constructskill.plugin  # noqa: F401
-from lerobot_constructskill.contract import CAMERAS, FPS, get_task
+from lerobot_constructskill import presets
+from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
-from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.runs import list_runs
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
 SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
-DOSE = sorted((CONFIGS / "dose").glob("*.yaml"))
+DOSES = {0: "fast_noise_free", 2: "dose/sigma_02mm", 5: "dose/sigma_05mm", 10: "fast"} | {
+    millimetres: f"dose/sigma_{millimetres}mm" for millimetres in (20, 30)
+}
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
 
@@ -59,31 +62,33 @@ def test_executed_labels_differ_from_fast_in_the_labels_alone():
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
-def test_a_study_names_data_sets_that_exist_and_policies_that_lerobot_knows(path):
-    plan = draccus.parse(StudyConfig, path, args=[]).plan
-    data = [s.data for s in plan.settings.values()] + [v.data for v in plan.variants.values() if v.data]
-    assert all((CONFIGS.parent / file).is_file() for file in data)
-    for setting in plan.settings.values():
-        assert ConstructSkillEnvConfig(**setting.env).task == generate_config(CONFIGS.parent / setting.data).task
-    for variant in plan.variants.values():
-        assert draccus.decode(PreTrainedConfig, variant.policy).type == variant.policy["type"]
+def test_a_study_is_runs_that_can_be_made(path):
+    """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
+    for run in list_runs(draccus.parse(StudyConfig, path, args=[]).study):
+        assert all(run.arm.env["task"] == data.config.task for data in run.arm.validated_on)
 
 
 def test_the_papers_study_is_its_52_runs():
-    plan = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[]).plan
-    assert len(plan.runs) == 52 and plan.episodes == 10 and len(plan.pairs) == 6
-    backbones = {variant.policy["backbone"] for variant in plan.variants.values() if variant.seeds == 10}
-    assert backbones == set(BACKBONES)
-    cut = draccus.parse(StudyConfig, CONFIGS / "study" / "dense.yaml", args=["--seeds=4"]).plan
+    config = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[])
+    variants = config.study.variants.values()
+    assert sum(variant.seeds for variant in variants) == 52 and config.episodes == 10
+    assert len(config.analysis.comparisons) == 6
+    assert {variant.policy["backbone"] for variant in variants if variant.seeds == 10} == set(BACKBONES)
+    cut = draccus.parse(StudyConfig, CONFIGS / "study" / "dense.yaml", args=["--seeds=4"]).study
     assert {variant.seeds for variant in cut.variants.values()} == {4} and max(cut.references.values()) == 4
 
 
 def test_the_dose_response_is_six_doses_of_fast():
     fast = generate_config(CONFIGS / "generate" / "fast.yaml")
-    doses = {int(re.search(r"\d+", path.stem)[0]): generate_config(path) for path in DOSE}
-    assert list(doses) == [0, 2, 5, 10, 20, 30]
-    for millimetres, config in doses.items():
+    assert set(DOSES.values()) >= {name for name in presets.names("generate") if name.startswith("dose/")}
+    for millimetres, name in DOSES.items():
+        config = generate_config(presets.find("generate", name))
         assert config == replace(fast, noise=replace(fast.noise, sigma=millimetres / 1000))
+
+
+def test_no_two_generation_configs_make_the_same_set():
+    made = {name: generate_config(presets.find("generate", name)) for name in presets.names("generate")}
+    assert not [(a, b) for a, b in combinations(made, 2) if made[a] == made[b]]
 
 
 @pytest.fixture
@@ -108,8 +113,8 @@ def test_training_configs_hold_out_every_eighth_episode_and_no_other(path, train
     config = train_config(path)
     episodes = config.dataset.episodes
     n_held_out = math.ceil(len(episodes) * config.dataset.eval_split)
-    assert sorted(episodes) == list(range(len(episodes)))
-    assert episodes[-n_held_out:] == [i for i in range(len(episodes)) if i % 8 == 7]
+    assert sorted(episodes) == list(range(80)) and episodes == held_out_last(80)
+    assert episodes[-n_held_out:] == [i for i in range(80) if i % 8 == 7] == held_out(80)
     assert config.eval_steps and config.steps % config.eval_steps == 0
 
 

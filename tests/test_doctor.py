@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_constructskill.scripts import checks
-from lerobot_constructskill.scripts.checks import Finding, Level, Probe
+from lerobot_constructskill.scripts import doctor_checks as checks
 from lerobot_constructskill.scripts.doctor import diagnose, probe
+from lerobot_constructskill.scripts.doctor_checks import Finding, Level, Probe
 
 REPOSITORY = Path(__file__).parents[1]
 REQUIREMENTS = ["lerobot[dataset]<0.7,>=0.6.1", "sapien<3.1,>=3.0.3; extra == 'sim'", "ruff; extra == 'dev'"]

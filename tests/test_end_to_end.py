@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from commands import QUICK, call
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.study.plan import Training
-from lerobot_constructskill.study.train import heldout_mse, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, train_seeds
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -75,8 +76,10 @@ def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reac
     theirs = float(log.split("heldout_translation_mse_m2=")[1].split()[0])
     root, repo_id = (flag.split("=")[1] for flag in features)
     dataset, config = LeRobotDataset(repo_id, root=root), FrozenViTChunkConfig(device="cpu")
-    policies = train_seeds(config, dataset, range(20), Training(15, 70, holdout=2))
-    ours = heldout_mse(policies, dataset, 2, dataset.meta.stats)
+    episodes = held_out(dataset.num_episodes, 2)
+    policies = train_seeds(config, dataset, range(20), epochs=15, batch_size=70, held_out=episodes)
+    preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=dataset.meta.stats)
+    ours = heldout_mse(policies, dataset, episodes, preprocess)
     middle, spread = np.mean(ours), np.std(ours, ddof=1)
     assert abs(theirs - middle) < 4 * spread < middle, (theirs, ours)
 

@@ -25,10 +25,10 @@ def broken(*arguments, **options):
     assert "--debug" not in sys.argv
     raise {error}
 parsing.parse = broken
-module.diagnose = broken
+module.diagnose = module.show = broken
 module.{function}()
 """
-"""A command whose first piece of work is broken: constructskill-doctor has no configuration to parse."""
+"""A command whose first piece of work is broken: constructskill-doctor and -config have no configuration to parse."""
 
 
 def run(command: str, error: str, state: Path, *flags: str) -> subprocess.CompletedProcess[str]:
@@ -107,23 +107,8 @@ def test_the_traceback_tells_what_a_sentence_hides() -> None:
         assert "KeyError: 'the cause'" in full_traceback(error)
 
 
-def test_a_failed_run_of_a_study_keeps_its_traceback(tmp_path: Path) -> None:
-    from lerobot_constructskill.study.checkpoints import Job
-    from lerobot_constructskill.study.jobs import execute
-    from lerobot_constructskill.study.plan import Setting, StudyPlan, Variant
-    from lerobot_constructskill.study.prepare import Store
-
-    plan = StudyPlan("x", {"fixed": Setting("absent.yaml")}, {"a": Variant({"type": "frozen_vit"}, seeds=2)})
-    job = Job(plan, tuple(plan.runs), tmp_path, Store(tmp_path / "data"))
-    for run, [row] in execute(job):
-        said = "There is no constructskill-generate configuration 'absent.yaml'."
-        assert row.error.endswith(said)
-        log = (tmp_path / "logs" / f"{run.id}.log").read_text()
-        assert "Traceback" in log and "in _demonstrations_of" in log and said in log
-
-
 def test_a_traceback_comes_home_from_a_simulators_process() -> None:
-    from lerobot_constructskill.study.simulators import _attempt
+    from lerobot_constructskill.rollout.simulators import _attempt
 
     class Broken:
         def reset(self, seed):

@@ -9,8 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_constructskill import presets
+from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.scripts.config import show
+
 REPOSITORY = Path(__file__).parents[1]
-PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
+PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 
 REGISTRIES = [
     ".".join(parts)
@@ -80,6 +85,61 @@ assert "torch" not in sys.modules, "--help imports torch"
 def test_help_does_not_wait_for_torch(command: str, target: str) -> None:
     module, function = target.split(":")
     run_python(HELP.format(command=command, module=module, function=function))
+
+
+def test_the_wheel_ships_every_configuration_where_an_installed_copy_looks() -> None:
+    shipped = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert shipped["configs"] == "lerobot_constructskill/configs"
+    assert presets.FOLDER == REPOSITORY / "configs"
+
+
+def test_every_configuration_has_a_name_and_says_what_it_is() -> None:
+    named = {presets.find(kind, name) for kind in presets.KINDS for name in presets.names(kind)}
+    assert named == set((REPOSITORY / "configs").rglob("*.yaml"))
+    lines = show().splitlines()
+    assert len(lines) == len(named) and all(len(line.split()) > 3 for line in lines)
+    assert show("train/act") == str(REPOSITORY / "configs" / "train" / "act.yaml")
+
+
+def test_a_name_wins_over_a_file_called_like_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in "fast", "mine", "mine.yaml":
+        (tmp_path / name).touch()
+    assert presets.find("generate", "fast") == REPOSITORY / "configs" / "generate" / "fast.yaml"
+    assert presets.find("generate", "mine") == Path("mine")
+    assert presets.find("generate", tmp_path / "mine.yaml") == tmp_path / "mine.yaml"
+
+
+@pytest.mark.parametrize("name", ["absent", "absent.yaml", "train/act", "../train/act", "suite", ""])
+def test_a_name_that_is_none_is_answered_with_those_there_are(name: str) -> None:
+    with pytest.raises(MissingError, match=f"'{name}'.* fast, .* suite/block_to_bin"):
+        presets.find("generate", name)
+
+
+COMMAND = """
+import sys
+sys.argv = ["constructskill-generate", {arguments}]
+from lerobot_constructskill.scripts import generate
+generate.generate = lambda config: f"{{config.task}} {{config.episodes}} {{config.repo_id}}"
+generate.main()
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments", ["'smoke'", "'configs/generate/smoke.yaml'", "'--config_path=configs/generate/smoke.yaml'"]
+)
+def test_a_command_takes_a_name_a_file_or_a_flag(arguments: str) -> None:
+    assert run_python(COMMAND.format(arguments=f"{arguments}, '--repo_id=a/b'")) == "brick_to_bin 2 a/b\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [("'fsat'", "'fsat'; by name there are: dose/"), ("'fast', '--config_path=x'", "give one of them")],
+)
+def test_a_command_tells_what_is_wrong_with_a_name(arguments: str, said: str) -> None:
+    code = COMMAND.format(arguments=arguments)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 1 and said in done.stderr and len(done.stderr.splitlines()) == 1
 
 
 def own_files() -> list[str]:

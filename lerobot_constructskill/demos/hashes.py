@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.digests import file_sha256
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.hashing import file_sha256
 
 
 def file_hashes(root: Path) -> dict[str, str]:

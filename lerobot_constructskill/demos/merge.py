@@ -12,7 +12,7 @@ from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import MODALITY, modality
-from lerobot_constructskill.demos.settings import GenerateConfig, package_versions, provenance
+from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
 from lerobot_constructskill.errors import InputError
 
@@ -38,11 +38,11 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     task = get_task(config.task)
     (folder / MODALITY).write_text(json.dumps(modality(task, config.obs_type), indent=2) + "\n")
     facts = {
-        "generator": provenance(config) | {"light_robot": attempts[0].light_robot},
+        "generator": generator_facts(config) | {"light_robot": attempts[0].light_robot},
         "noise_covariance": (config.noise.root @ config.noise.root).tolist(),
         "attempts": len(attempts),
         "discarded_seeds": [attempt.seed for attempt in attempts if not attempt.success],
-        "versions": package_versions(),
+        "versions": frame_versions(),
         "sha256": file_hashes(folder),
     }
     (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n")

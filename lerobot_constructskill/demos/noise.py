@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
-MODELS = ("none", "fixed", "isotropic", "dart")
+MODELS = ("fixed", "isotropic", "dart")
 FITTED = ("isotropic", "dart")
 
 
@@ -16,8 +16,8 @@ class NoiseConfig:
     """Zero-mean Gaussian noise on the executed translation.
 
     Args:
-        model: `none`; `fixed`: `sigma` on every axis (paper, section II); `dart`: the fitted `covariance`;
-            `isotropic`: as strong as that covariance, but alike on every axis.
+        model: `fixed`: `sigma` on every axis (paper, section II); `dart`: the fitted `covariance`; `isotropic`: as
+            strong as that covariance, but alike on every axis.
         sigma: standard deviation per axis of `fixed`, in metres; 0 turns noise off.
         covariance: 3 x 3, in m2: a policy's error on held-out demonstrations, as `constructskill-fit-noise` writes it.
         fitted_on: what the covariance was fitted on, for the data set's provenance.
@@ -53,8 +53,6 @@ class NoiseConfig:
     @property
     def root(self) -> np.ndarray:
         """Symmetric square root of the covariance that is drawn from, (3, 3) in metres."""
-        if self.model == "none":
-            return np.zeros((3, 3))
         if self.model == "fixed":
             return self.sigma * np.eye(3)
         covariance = np.array(self.covariance)

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.folders import staged
+from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
 from lerobot_constructskill.errors import InputError, MachineError
-from lerobot_constructskill.pools import open_pool
 from lerobot_constructskill.progress import Progress, quiet
-from lerobot_constructskill.staging import staged
 
 SHARDS = "shards"
 
@@ -49,14 +49,20 @@ def record(config: GenerateConfig) -> Summary:
     from lerobot.utils.constants import HF_LEROBOT_HOME
 
     root = Path(config.root) if config.root else HF_LEROBOT_HOME / config.repo_id
-    _check_disk(config, root)
+    check_disk(config, root)
     with staged(root, keep=SHARDS) as folder:
-        shards = folder.with_name(SHARDS) / frames_digest(config)
-        attempts = _run_attempts(config, shards)
-        with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
-            merge(config, attempts, shards, folder)
+        attempts = write(config, folder)
     lengths = [outcome.frames for outcome in attempts if outcome.success]
     return Summary(root, len(lengths), sum(lengths), [outcome.seed for outcome in attempts if not outcome.success])
+
+
+def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
+    """Write the data set to a path that `staged` gave, by way of shards beside it. Raises as `record` does."""
+    shards = folder.with_name(SHARDS) / frames_digest(config)
+    attempts = _run_attempts(config, shards)
+    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
+        merge(config, attempts, shards, folder)
+    return attempts
 
 
 def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
@@ -96,7 +102,7 @@ def _check_failures(config: GenerateConfig, failures: int) -> None:
         )
 
 
-def _check_disk(config: GenerateConfig, root: Path) -> None:
+def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
     longest = config.episodes * config.max_steps
     needed = 2 * BYTES_PER_IMAGE * longest * len(OBS_TYPES[config.obs_type])

@@ -1,20 +1,18 @@
 """What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
 
-import hashlib
-import json
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from typing import Any
 
+from lerobot_constructskill.artifacts.digests import digest, versions
+from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed")
-EXECUTORS = ("processes", "ray")
 
-PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
+FRAME_PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
 
 
@@ -69,7 +67,7 @@ class GenerateConfig:
                 raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
 
 
-def provenance(config: GenerateConfig) -> dict[str, Any]:
+def generator_facts(config: GenerateConfig) -> dict[str, Any]:
     """What the data set says of its generation; nothing of where and how fast it ran."""
     facts = asdict(config)
     for name in ("root", "workers", "executor"):
@@ -78,13 +76,12 @@ def provenance(config: GenerateConfig) -> dict[str, Any]:
 
 
 def frames_digest(config: GenerateConfig) -> str:
-    """Hash of everything that a frame depends on, so that shards of two settings never meet in one data set."""
-    facts = provenance(config)
+    """Digest of everything that a frame depends on, so that shards of two settings never meet in one data set."""
+    facts = generator_facts(config)
     for name in ("repo_id", "episodes", "max_failures", "seed_start"):
         del facts[name]
-    text = json.dumps([facts, package_versions()], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return digest(facts | {"versions": frame_versions()})
 
 
-def package_versions() -> dict[str, str]:
-    return {name: version(name) for name in PACKAGES}
+def frame_versions() -> dict[str, str]:
+    return versions(*FRAME_PACKAGES)

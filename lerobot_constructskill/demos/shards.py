@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
@@ -13,7 +14,6 @@ from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.progress import quiet
-from lerobot_constructskill.staging import staged
 
 OUTCOME = "attempt.json"
 EPISODE = "episode"

@@ -226,3 +226,13 @@ class ConstructSkillEnv(gym.Env):
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
         return {"is_success": bool(info["success"][0]), **booleans}
+
+
+def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
+    """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
+    try:
+        from lerobot_constructskill.sim.rendering import best_render_backend
+    except ModuleNotFoundError:
+        return light_robot, render_backend
+    backend = best_render_backend() if render_backend == "auto" else render_backend
+    return (backend == "cpu" if light_robot is None else light_robot), backend

@@ -1,7 +1,5 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
-import hashlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,15 +15,15 @@ from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 
+from lerobot_constructskill.artifacts.digests import data_sha256, digest
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.hashing import data_sha256
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.progress import Progress, quiet
-from lerobot_constructskill.staging import replaced
 
 PARTS = "encoded"
 """Folder for finished episodes, beside the feature set in the making."""
@@ -39,6 +37,9 @@ def load_encoder(
     precision: str = AUTO,
     crop: Crop | None = None,
     device: torch.device | str = "cpu",
+    pretrained: bool = True,
+    blind: bool = False,
+    sha256: str | None = None,
 ) -> tuple[FrozenEncoder, dict[str, str]]:
     """Return an encoder with its weights on a device, and the description that its features carry.
 
@@ -49,12 +50,12 @@ def load_encoder(
     spec = get_backbone(backbone)
     precision = resolve_precision(precision, device)
     check_native(precision, device)
-    state, source = load_weights(spec, path)
-    encoder = FrozenEncoder(spec, precision, crop)
+    state, source = load_weights(spec, path, sha256, pretrained)
+    encoder = FrozenEncoder(spec, precision, crop, blind)
     encoder.model.load_state_dict(state)
     encoder.to(device)
     made = {"weights_source": source, "runtime": encoder.runtime}
-    return encoder, {**describe(spec, state_sha256(state), precision, crop), **made}
+    return encoder, {**describe(spec, state_sha256(state), precision, crop, blind), **made}
 
 
 def write_feature_set(
@@ -81,7 +82,7 @@ def write_feature_set(
         ValueError: the data set has no such camera.
     """
     info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
-    made_of = {**info, "camera": camera, "encoder": type(encoder).__name__, "patches": patches}
+    made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
     features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
     _write_copy(dataset, camera, features, info, repo_id, folder)
@@ -119,7 +120,7 @@ def _parts_folder(folder: Path, made_of: dict[str, Any]) -> Path:
 
     Nothing that was made otherwise is ever taken for a part: what they are made of is in the folder's name.
     """
-    return folder.with_name(PARTS) / hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()[:16]
+    return folder.with_name(PARTS) / digest(made_of)
 
 
 def _part(parts: Path, episode: dict) -> Path:

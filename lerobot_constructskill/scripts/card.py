@@ -24,12 +24,12 @@ def write_card(config: CardConfig) -> str:
         FileNotFoundError: there is no data set in `root`.
         ValueError: a file that cannot be read.
     """
-    from lerobot_constructskill.data.card import describe, render
-    from lerobot_constructskill.data.dataset import open_dataset
-    from lerobot_constructskill.data.plots import contact_sheet, trajectories
+    from lerobot_constructskill.dataset.card import card_facts, render
+    from lerobot_constructskill.dataset.dataset import open_dataset
+    from lerobot_constructskill.dataset.plots import contact_sheet, trajectories
 
     data, out = open_dataset(config.root), config.out or config.root
-    facts = describe(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
+    facts = card_facts(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
     contact_sheet(data, out / "pictures" / "contact_sheet.png")
     trajectories(data, out / "pictures" / "trajectories.png")
     (out / "README.md").write_text(render(facts))

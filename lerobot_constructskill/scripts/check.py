@@ -23,9 +23,9 @@ def check(config: CheckConfig) -> str:
         FileNotFoundError: there is no such data set.
         ValueError: something is wrong with it, or neither a name nor a folder was given.
     """
-    from lerobot_constructskill.data.checks import CHECKS, complaints
-    from lerobot_constructskill.data.dataset import open_dataset
-    from lerobot_constructskill.data.hub import locate
+    from lerobot_constructskill.dataset.checks import CHECKS, complaints
+    from lerobot_constructskill.dataset.dataset import open_dataset
+    from lerobot_constructskill.dataset.hub import locate
     from lerobot_constructskill.progress import Progress
 
     data = open_dataset(locate(config.repo_id, config.root, config.revision))

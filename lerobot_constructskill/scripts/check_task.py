@@ -19,7 +19,7 @@ REQUIRED = 0.95
 
 
 @dataclass
-class CheckConfig:
+class CheckTaskConfig:
     """Check one task of the contract table.
 
     Raises:
@@ -39,9 +39,9 @@ class CheckConfig:
             raise InputError(f"states must be at least 1, not {self.states}.")
 
 
-def check(config: CheckConfig) -> str:
-    from lerobot_constructskill.study.stats.intervals import clopper_pearson
-    from lerobot_constructskill.study.stats.outcomes import Counts
+def check(config: CheckTaskConfig) -> str:
+    from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
+    from lerobot_constructskill.analysis.stats.outcomes import Counts
 
     sheet = save_contact_sheet(config)
     lengths, failures = measure_expert(config)
@@ -58,7 +58,7 @@ def check(config: CheckConfig) -> str:
     return report
 
 
-def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
+def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
     """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import make_expert
@@ -78,7 +78,7 @@ def measure_expert(config: CheckConfig) -> tuple[list[int], list[int]]:
     return lengths, failures
 
 
-def save_contact_sheet(config: CheckConfig) -> Path:
+def save_contact_sheet(config: CheckTaskConfig) -> Path:
     """Save the start of each phase and the end, the policy's view above a close-up, and return the picture's path."""
     import numpy as np
     from PIL import Image
@@ -98,7 +98,7 @@ def save_contact_sheet(config: CheckConfig) -> Path:
             columns[phase] = (obs["pixels"]["base"], env.render())
 
     with Progress(desc="contact sheet", unit="step") as bar:
-        demonstrate(env, expert, NoiseConfig(model="none"), DEMO_SEED_START, watch=keep)
+        demonstrate(env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START, watch=keep)
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"
@@ -113,7 +113,7 @@ def run_tests(task: str) -> int:
 
 
 def main() -> None:
-    run(CheckConfig, check)
+    run(CheckTaskConfig, check)
 
 
 if __name__ == "__main__":

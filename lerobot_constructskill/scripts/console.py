@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
-from lerobot_constructskill.errors import UserError, full_traceback
+from lerobot_constructskill.errors import InputError, UserError, full_traceback
+from lerobot_constructskill.presets import find, names
 
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 """Exit statuses: the user's to mend; a defect of ours; Ctrl-C."""
@@ -19,12 +20,32 @@ DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
 
 
-def run[Config](config_class: type[Config], action: Callable[[Config], str]) -> None:
-    """Parse `config_class` from the command line and print what `action` returns, inside `edge`."""
+def run[Config](config_class: type[Config], action: Callable[[Config], str], presets: str | None = None) -> None:
+    """Parse `config_class` from the command line and print what `action` returns, inside `edge`.
+
+    Where `presets` is a kind of shipped configurations, one of them, or a file, can stand before all flags.
+    """
     with edge():
         from lerobot_constructskill.parsing import parse
 
-        print(action(parse(config_class, epilog=EPILOG)))
+        flags, epilog = sys.argv[1:], EPILOG
+        if presets:
+            flags, epilog = _put_file(flags, presets), f"{_tell_names(presets)} {EPILOG}"
+        print(action(parse(config_class, flags, epilog=epilog)))
+
+
+def _put_file(flags: list[str], kind: str) -> list[str]:
+    """Replace a name or file that comes before all flags by `--config_path`."""
+    if not flags or flags[0].startswith("-"):
+        return flags
+    name, *others = flags
+    if any(flag.split("=")[0] == "--config_path" for flag in others):
+        raise InputError(f"'{name}' and --config_path are two configurations; give one of them.")
+    return [f"--config_path={find(kind, name)}", *others]
+
+
+def _tell_names(kind: str) -> str:
+    return f"The first argument, in place of --config_path, can be a file or one of these: {', '.join(names(kind))}."
 
 
 @contextmanager

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable
 from importlib import metadata
 
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.scripts.checks import (
+from lerobot_constructskill.scripts.console import EPILOG, edge
+from lerobot_constructskill.scripts.doctor_checks import (
     DISTRIBUTION,
     Finding,
     Level,
@@ -24,7 +25,6 @@ from lerobot_constructskill.scripts.checks import (
     judge_vulkan,
     judge_weights,
 )
-from lerobot_constructskill.scripts.console import EPILOG, edge
 
 PROBE_TIMEOUT_S = 600  # importing LeRobot took 3 minutes on one core of a busy machine
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
-from lerobot_constructskill.staging import staged
 
 
 @dataclass
@@ -42,7 +42,7 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot.utils.constants import HF_LEROBOT_HOME
     from lerobot.utils.device_utils import auto_select_torch_device
 
-    from lerobot_constructskill.data.hub import open_lerobot
+    from lerobot_constructskill.dataset.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
     if config.batch_size < 1:

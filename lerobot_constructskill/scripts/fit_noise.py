@@ -16,7 +16,7 @@ class FitNoiseConfig:
 
     policy_path: str  # a checkpoint's `pretrained_model` folder, or a name on the Hub
     repo_id: str  # the demonstrations, with their images and phases
-    out: Path  # YAML to write, for constructskill-generate --config_path
+    out: Path  # YAML to write, for constructskill-generate
     root: Path | None = None  # the demonstrations' folder; LeRobot's cache when left out
     episodes: list[int] | None = None  # held-out episodes; every eighth when left out
     alpha: float | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
@@ -36,10 +36,10 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot.utils.device_utils import auto_select_torch_device
 
     import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.data.hub import one_sentence, open_lerobot
+    from lerobot_constructskill.dataset.hub import one_sentence, open_lerobot
     from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
     from lerobot_constructskill.progress import Progress
-    from lerobot_constructskill.study.agents import PolicyAgent
+    from lerobot_constructskill.rollout.agents import PolicyAgent
 
     dataset = open_lerobot(config.repo_id, config.root)
     generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
@@ -48,7 +48,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
         raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
     with one_sentence(config.policy_path):
         device = config.device or str(auto_select_torch_device())
-        agent = PolicyAgent.from_pretrained(config.policy_path, device, config.backbone_precision)
+        agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
     bar = Progress(episodes, "demonstrations", unit="demo")
     errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]

@@ -13,7 +13,7 @@ def generate(config: GenerateConfig) -> str:
 
 
 def main() -> None:
-    run(GenerateConfig, generate)
+    run(GenerateConfig, generate, presets="generate")
 
 
 if __name__ == "__main__":

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from glob import glob
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.hashing import data_sha256, file_sha256
 from lerobot_constructskill.scripts.console import run
-from lerobot_constructskill.staging import replaced
 
 
 @dataclass
@@ -51,7 +51,7 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
-    from lerobot_constructskill.data.hub import open_lerobot
+    from lerobot_constructskill.dataset.hub import open_lerobot
     from lerobot_constructskill.progress import Progress
 
     checkpoints = _find(config.policies)
@@ -85,10 +85,10 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
     import torch
 
     import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.study.agents import PolicyAgent
-    from lerobot_constructskill.study.offline import observed, offline_metrics, predict
+    from lerobot_constructskill.rollout.agents import PolicyAgent
+    from lerobot_constructskill.rollout.offline import observed, offline_metrics, predict
 
-    agent = PolicyAgent.from_pretrained(checkpoint, config.device, config.backbone_precision)
+    agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)

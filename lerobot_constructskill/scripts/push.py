@@ -30,9 +30,9 @@ def push_dataset(config: PushConfig) -> str:
         ValueError: a check found something wrong.
         OSError: the Hub refused, or the connection broke.
     """
-    from lerobot_constructskill.data.checks import CHECKS, complaints
-    from lerobot_constructskill.data.dataset import open_dataset
-    from lerobot_constructskill.data.hub import push
+    from lerobot_constructskill.dataset.checks import CHECKS, complaints
+    from lerobot_constructskill.dataset.dataset import open_dataset
+    from lerobot_constructskill.dataset.hub import push
     from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.scripts.card import CardConfig, write_card
 

@@ -30,8 +30,8 @@ def push_policy(config: PushPolicyConfig) -> str:
         FileNotFoundError: there is no checkpoint, or no evaluation.
         OSError: the Hub refused, or the connection broke.
     """
-    from lerobot_constructskill.data.hub import one_sentence
-    from lerobot_constructskill.data.policy_card import render_outcomes, seed_outcomes
+    from lerobot_constructskill.dataset.hub import one_sentence
+    from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 
     train, policy = (_read(config.policy_path / name) for name in ("train_config.json", "config.json"))
     section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)

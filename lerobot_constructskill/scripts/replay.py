@@ -25,9 +25,9 @@ def replay_all(config: ReplayConfig) -> str:
         ValueError: no such episode, or outcomes that differ.
         OSError: this machine cannot render.
     """
-    from lerobot_constructskill.data.dataset import open_dataset
-    from lerobot_constructskill.data.hub import locate
-    from lerobot_constructskill.data.replay import replay
+    from lerobot_constructskill.dataset.dataset import open_dataset
+    from lerobot_constructskill.dataset.hub import locate
+    from lerobot_constructskill.dataset.replay import replay
     from lerobot_constructskill.demos.expert import Phase
     from lerobot_constructskill.progress import Progress
 

@@ -10,8 +10,8 @@ from lerobot_constructskill.scripts.console import run
 class ReportConfig:
     """Write report.html, report.md and figures/ into a study's folder.
 
-    The folder holds plan.yaml and rows.parquet, and may hold provenance.json, one JSON object of names and values to
-    show. A study need not be complete.
+    The folder holds study.yaml, whose section `analysis` says how the rows are read, and rows.parquet. It may hold
+    provenance.json, one JSON object of names and values to show. A study need not be complete.
     """
 
     root: Path
@@ -21,10 +21,10 @@ def report(config: ReportConfig) -> Path:
     """Write a report and return its page.
 
     Raises:
-        FileNotFoundError: the folder holds no study.
-        ValueError: its files cannot be read, or its rows are another plan's.
+        MissingError: the folder holds no study.
+        InputError: its files cannot be read, or do not belong together.
     """
-    from lerobot_constructskill.study.report.page import write_report
+    from lerobot_constructskill.analysis.report.page import write_report
 
     return write_report(config.root)
 

@@ -1,73 +1,96 @@
 """`constructskill-study`: a whole study, per training seed, from one file."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
+from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
-from lerobot_constructskill.study.plan import StudyPlan
+from lerobot_constructskill.study.spec import Options, Study
 
 
 @dataclass(frozen=True)
-class StudyConfig(StudyPlan):
-    """Run what is missing of a study, and keep what is finished; a killed study goes on with the same command.
+class StudyConfig(Options, Study):
+    """Make what is missing of a study, and keep what is there; a killed study goes on with the same command.
 
     Args:
-        root: the study's folder, `outputs/study/<name>` by default: plan.yaml, rows.parquet, checkpoints and videos.
-        data_root: where demonstrations and features are kept, for all studies.
-        seeds: cut every variant and reference to this many seeds. The cut plan is a plan of its own.
-        workers: processes that generate demonstrations; jobs at a time on Ray.
-        together: policies evaluated in lockstep.
-        executor: "processes" (this machine) or "ray" (folders on a file system that all its machines share).
-        retry_failed: run again what failed before.
+        analysis: labels, order, comparisons and their level; the report alone reads them.
+        root: the study's folder, `outputs/study/<name>` by default: study.yaml, rows.parquet and videos.
+        store: where demonstrations, features, checkpoints and runs are made, each once for all studies.
+        seeds: cut every variant and reference to this many seeds.
+        status: make nothing; say what is there, missing and failed, and why.
     """
 
+    analysis: Analysis = field(default_factory=Analysis)
     root: Path | None = None
-    data_root: Path = Path("outputs/data")
+    store: Path = Path("outputs/store")
     seeds: int | None = None
-    workers: int = 2
-    together: int = 10
-    executor: str = "processes"
-    retry_failed: bool = False
+    status: bool = False
+
+    def __post_init__(self):
+        Study.__post_init__(self)
+        Options.__post_init__(self)
+        if self.seeds is not None and self.seeds < 1:
+            raise InputError(f"seeds must be at least 1, not {self.seeds}.")
+        self.analysis.check(self.variants, [*self.settings, *self.references])
 
     @property
-    def plan(self) -> StudyPlan:
+    def study(self) -> Study:
         """The study without how it is run."""
-        plan = StudyPlan(**{field.name: getattr(self, field.name) for field in fields(StudyPlan)})
+        study = Study(**{field.name: getattr(self, field.name) for field in fields(Study)})
         if self.seeds is None:
-            return plan
-        variants = {name: replace(v, seeds=min(v.seeds, self.seeds)) for name, v in plan.variants.items()}
-        references = {name: min(count, self.seeds) for name, count in plan.references.items()}
-        return replace(plan, variants=variants, references=references)
+            return study
+        variants = {name: replace(v, seeds=min(v.seeds, self.seeds)) for name, v in study.variants.items()}
+        references = {name: min(count, self.seeds) for name, count in study.references.items()}
+        return replace(study, variants=variants, references=references)
 
 
 def study(config: StudyConfig) -> str:
-    """Run a study and return a sentence about its rows.
+    """Run a study, or look at one, and return what is to be said of it.
 
     Raises:
         FileExistsError: another process is running it.
-        FileNotFoundError: a data set's configuration does not exist.
-        ValueError: the folder holds another plan's results, or not one run succeeded.
+        ValueError: nothing can be run with a field of the study, or not one run succeeded.
     """
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.study.checkpoints import settle_precision
-    from lerobot_constructskill.study.prepare import Store
-    from lerobot_constructskill.study.run import Options, run_study
+    from lerobot.utils.import_utils import register_third_party_plugins
 
-    root = config.root or Path("outputs/study") / config.name
-    options = Options(config.together, config.executor, config.workers, config.retry_failed)
-    plan, store = settle_precision(config.plan), Store(config.data_root.absolute(), config.workers)
-    rows = run_study(plan, root.absolute(), store, options)
-    runs = rows.groupby(["setting", "variant", "training_seed"])["error"].first()
-    if runs.notna().all():
-        why = f"their tracebacks are in {root / 'logs'}; the first: {runs.iloc[0]}"
-        raise InputError(f"All {len(runs)} runs failed; {why}")
-    failed = f", {runs.notna().sum()} of them failed (why: {root / 'logs'})" if runs.notna().any() else ""
-    return f"{len(runs)} runs{failed}: {root} (next: constructskill-report --root={root})"
+    import lerobot_constructskill.plugin  # noqa: F401
+
+    register_third_party_plugins()
+    from lerobot_constructskill.artifacts.store import Store
+    from lerobot_constructskill.study.run import run_study
+    from lerobot_constructskill.study.runs import list_runs
+    from lerobot_constructskill.study.table import Table, status
+
+    root = (config.root or Path("outputs/study") / config.name).absolute()
+    store = Store(config.store.absolute())
+    if config.status:
+        return status(Table(root, list_runs(config.study), store))
+    table = run_study(config.study, _text(config), root, store, config)
+    failed, missing = table.failed(), table.missing()
+    made = len(table.runs) - len(missing)
+    if len(failed) == made:
+        raise InputError(f"All {made} runs failed, the first with: {table.episodes(failed[0])[0].error}")
+    lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
+    left = f", {len(missing)} missing" if missing else ""
+    return f"{made} runs{lacking}{left}: {root} (next: constructskill-report --root={root})"
+
+
+def _text(config: StudyConfig) -> str:
+    """The study as it was read, with the labels of its references."""
+    import draccus
+    import yaml
+
+    from lerobot_constructskill.rollout.references import REFERENCES
+
+    labels = {name: REFERENCES[name].label for name in config.references if name in REFERENCES}
+    analysis = replace(config.analysis, labels=labels | config.analysis.labels)
+    text = {**draccus.encode(config.study), "analysis": draccus.encode(analysis)}
+    return yaml.safe_dump(text, sort_keys=False, allow_unicode=True)
 
 
 def main() -> None:
-    run(StudyConfig, study)
+    run(StudyConfig, study, presets="study")
 
 
 if __name__ == "__main__":

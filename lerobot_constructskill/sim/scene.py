@@ -34,6 +34,7 @@ from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import seen_from
+from lerobot_constructskill.sim.rendering import best_render_backend
 from lerobot_constructskill.sim.shader import colour_shader
 from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
 
@@ -56,14 +57,6 @@ NO_DEVICE = ("vk::", "vulkan", "rendering device", "physical device")
 """What SAPIEN's errors say, in lower case, where there is nothing to render with."""
 
 HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
-
-
-def best_render_backend() -> str:
-    """ManiSkill's "gpu" where a GPU can render, else "cpu"."""
-    try:
-        return "gpu" if sapien.Device("cuda").can_render() else "cpu"
-    except RuntimeError:
-        return "cpu"
 
 
 @cache

@@ -1,4 +1,8 @@
-"""The rows of a study: one per evaluation episode, in one tidy parquet table. No torch, no simulator."""
+"""The rows of a study: one per evaluation episode, in one tidy parquet table. No torch, no simulator.
+
+A run keeps its own episodes as `EpisodeRow`; the table of a study says of each which setting and variant it is, and
+has one row for every run that failed or has not been made.
+"""
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
@@ -8,47 +12,46 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.staging import replaced
 
-STAGES = ("none", "lifted", "in_bin", "placed")
-"""How far an episode came, in order."""
+STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
+"""Files in a study's folder: the study as it was read, its rows, and what is known of how they were made."""
+
+VARIANT, REFERENCE, SIGHTLESS = "variant", "reference", "sightless"
+"""Roles: what is compared; a floor or ceiling; one of those that does not look at the scene."""
+
+NOT_RUN = "not_run"
+"""`error_kind` of a run that has not been made; any other kind is that of an exception (`errors.kind`)."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One evaluation episode, or one run that failed.
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRow:
+    """One evaluation episode, or one run without any.
 
     Args:
-        plan_sha256: hash of the study's plan.
-        setting: the plan's setting.
-        variant: the plan's variant, or a reference such as "no_op".
-        is_reference: whether `variant` is a floor or ceiling.
+        run: digest of the run's specification; null for runs made before runs had one.
         training_seed: seed of the training run (of a reference: of its own randomness).
         evaluation_seed: seed of the episode's initial state.
         episode: 0, 1, ... within the run.
         lifted: whether the object was lifted at any step; null where the run failed.
         placed: whether it was placed at any step; null where the run failed.
-        stage: the furthest of `STAGES` reached.
+        stage: the furthest of `contract.STAGES` reached.
         lift_step: first step after which the object counted as lifted.
         place_step: first step after which it counted as placed.
         final_error_m: distance of the object from the goal's centre at the end, in metres.
         steps: length of the episode.
-        heldout_mse_m2: the run's translation error on the setting's held-out demonstrations, in m2.
-        heldout_mse_m2_by_data: JSON, the same on every configuration of demonstrations in the setting.
-        error: why the run failed, one sentence; null where it finished. A failed run has one row, episode 0.
+        error_kind: null where the run finished; `NOT_RUN`, or what kind of failure: "weights" (of a backbone, to be
+            had nowhere), "input", "missing", "taken", "machine" or "fault". Such a run has one row, episode 0.
+        error: why the run failed, one sentence.
         dataset_sha256: hash of the demonstrations; null for a reference that uses none.
         weights_sha256: hash of the policy's weights.
         environment_sha256: hash of the environment's configuration.
         backend: what rendered and simulated, such as "physx_cpu, cpu rendering".
         versions: JSON, package to version.
-        video: path of a video of the episode in the study's folder.
     """
 
-    plan_sha256: str
-    setting: str
-    variant: str
-    is_reference: bool
+    run: str | None
     training_seed: int
     evaluation_seed: int
     episode: int
@@ -59,56 +62,80 @@ class Row:
     place_step: int | None = None
     final_error_m: float | None = None
     steps: int | None = None
-    heldout_mse_m2: float | None = None
-    heldout_mse_m2_by_data: str | None = None
+    error_kind: str | None = None
     error: str | None = None
     dataset_sha256: str | None = None
     weights_sha256: str | None = None
     environment_sha256: str | None = None
     backend: str | None = None
     versions: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row(EpisodeRow):
+    """An episode's row in the table of a study.
+
+    Args:
+        setting: the study's setting.
+        variant: the study's variant, or a reference such as "no_op".
+        role: `VARIANT`, `REFERENCE` or `SIGHTLESS`.
+        episodes: how many evaluation episodes the run has, or is to have.
+        demonstrations: name of the data set that it was trained on; null for a reference that uses none.
+        heldout_mse_m2: the run's translation error on the setting's held-out demonstrations, in m2.
+        heldout_mse_m2_by_data: JSON, the same on every data set of the setting, by name.
+        video: path of a video of the episode in the study's folder.
+    """
+
+    setting: str
+    variant: str
+    role: str
+    episodes: int
+    demonstrations: str | None = None
+    heldout_mse_m2: float | None = None
+    heldout_mse_m2_by_data: str | None = None
     video: str | None = None
 
 
 _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
+def _schema(kind: type) -> pa.Schema:
+    return pa.schema([(field.name, _arrow_type(field.type)) for field in fields(kind)])
+
+
 def _arrow_type(annotation: type) -> pa.DataType:
     return next(arrow for kind, arrow in _ARROW.items() if kind in getattr(annotation, "__args__", (annotation,)))
 
 
-SCHEMA = pa.schema([(field.name, _arrow_type(field.type)) for field in fields(Row)])
-
-
-def write_rows(rows: Iterable[Row], path: Path) -> None:
-    """Write `rows` to a parquet file, which appears whole or not at all."""
-    table = pa.Table.from_pylist([asdict(row) for row in rows], schema=SCHEMA)
+def write_rows(rows: Iterable[EpisodeRow], path: Path, kind: type[EpisodeRow] = Row) -> None:
+    """Write `rows`, all of one `kind`, to a parquet file, which appears whole or not at all."""
+    table = pa.Table.from_pylist([asdict(row) for row in rows], schema=_schema(kind))
     with replaced(path) as partial:
         pq.write_table(table, partial)
 
 
-def read_rows(*paths: Path) -> pd.DataFrame:
-    """Read parquet files of rows into one table, pandas' nullable types, in the order given.
+def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
+    """Read a parquet file of rows of one `kind`, with pandas' nullable types.
 
     Raises:
-        ValueError: a file does not hold rows of a study.
+        InputError: the file does not hold such rows.
     """
-    return _read_tables(paths).to_pandas(types_mapper=_nullable)
+    return _read(path, kind).to_pandas(types_mapper=_nullable)
 
 
-def merge_rows(paths: Iterable[Path], merged: Path) -> None:
-    """Write the rows of `paths`, in their order, to one file, which appears whole or not at all."""
-    with replaced(merged) as partial:
-        pq.write_table(_read_tables(paths), partial)
+def load_rows[Kind: EpisodeRow](path: Path, kind: type[Kind] = Row) -> list[Kind]:
+    """Read the same as objects. Raises as `read_rows` does."""
+    return [kind(**row) for row in _read(path, kind).to_pylist()]
 
 
-def _read_tables(paths: Iterable[Path]) -> pa.Table:
-    tables = [SCHEMA.empty_table()]
-    for path in paths:
-        tables.append(pq.read_table(path))
-        if not tables[-1].schema.equals(SCHEMA):
-            raise InputError(f"'{path}' is not a table of study rows of this version.")
-    return pa.concat_tables(tables)
+def _read(path: Path, kind: type[EpisodeRow]) -> pa.Table:
+    try:
+        table = pq.read_table(path)
+    except pa.ArrowInvalid as error:
+        raise InputError(f"'{path}' cannot be read: {error}") from None
+    if not table.schema.equals(_schema(kind)):
+        raise InputError(f"'{path}' is not a table of study rows of this version.")
+    return table
 
 
 def _nullable(kind: pa.DataType):

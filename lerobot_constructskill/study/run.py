@@ -1,137 +1,99 @@
-"""Runs a study: what is missing is executed, what is finished is kept, and its table is always whole."""
+"""Runs a study: what is missing is made, what is there is kept, and its table is always whole."""
 
-import fcntl
 import json
 import os
 import platform
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import groupby
+from collections.abc import Iterator, Sequence
+from fnmatch import fnmatchcase
+from itertools import batched, groupby
 from pathlib import Path
 
-import draccus
-import pandas as pd
-import yaml
-
-from lerobot_constructskill.errors import InputError, TakenError
-from lerobot_constructskill.parsing import decode
-from lerobot_constructskill.pools import open_pool
+from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.locks import locked
+from lerobot_constructskill.artifacts.pools import open_pool
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.staging import replaced
-from lerobot_constructskill.study.checkpoints import Job
-from lerobot_constructskill.study.jobs import execute
-from lerobot_constructskill.study.plan import Run, StudyPlan
-from lerobot_constructskill.study.prepare import Store
-from lerobot_constructskill.study.rows import Row, merge_rows, read_rows, write_rows
+from lerobot_constructskill.study.execute import Job, make_runs
+from lerobot_constructskill.study.rows import PROVENANCE, STUDY
+from lerobot_constructskill.study.runs import Run, list_runs
+from lerobot_constructskill.study.spec import Options, Study
+from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import seconds_by_stage
+from lerobot_constructskill.study.validate import validate
 
-PLAN, ROWS, PROVENANCE = "plan.yaml", "rows.parquet", "provenance.json"
 
-
-@dataclass(frozen=True)
-class Options:
-    """How a study is run; none of it shows in its results.
+def run_study(study: Study, text: str, root: Path, store: Store, options: Options) -> Table:
+    """Make what is missing of a study and return its table.
 
     Args:
-        together: policies evaluated in lockstep.
-        executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
-            store on a file system that all its machines share).
-        workers: jobs at a time on Ray.
-        retry_failed: run again what failed before.
-    """
-
-    together: int = 10
-    executor: str = "processes"
-    workers: int = 1
-    retry_failed: bool = False
-
-
-def run_study(plan: StudyPlan, root: Path, store: Store, options: Options) -> pd.DataFrame:
-    """Run what is missing of a study and return its rows.
+        text: what `study.yaml` in the study's folder is to say, for the report.
+        root: the study's folder; its runs are in the store, which other studies may share.
 
     Raises:
-        ValueError: the folder holds another plan's results.
-        FileExistsError: another process is running this study.
-        OSError: a simulator's process died.
+        TakenError: another process is running the study in this folder.
+        InputError: nothing can be run with a field of the study, or no run is called as `options.only` says.
+        OSError: a simulator's process died, or another thing that is no run's fault.
     """
-    with _claimed(root):
-        _write_plan(plan, root)
+    runs = list_runs(study)
+    chosen = choose(runs, options.only)
+    with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
+        with replaced(root / STUDY) as partial:
+            partial.write_text(text)
+        table = Table(root, runs, store)
+        for run in table.failed() if options.retry_failed else []:
+            if run in chosen:
+                table.forget_failure(run)
+        missing = [run for run in chosen if table.episodes(run) is None]
+        with store.claim([run.artifact for run in chosen if run not in missing]):
+            pass  # which tidies up after a process that was killed when one of them was whole
+        table.write()
         earlier, start = _wall_time(root), time.monotonic()
-        runs = [*plan.reference_runs, *plan.runs]
-        finished = [run for run in runs if _is_finished(root, run, options)]
-        with Progress(total=len(runs), initial=len(finished), desc=plan.name, unit="run") as progress:
-            for run, rows in _execute(_jobs(plan, root, store, runs, finished, options.together), options):
-                write_rows(rows, _row_file(root, run))
-                _merge(root, runs)
+        with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:
+            for run in _execute(_jobs(missing, root, store, options), options):
+                table.write()
                 _write_provenance(root, earlier + time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
-        _merge(root, runs)
-        _write_provenance(root, earlier + time.monotonic() - start)
-        return read_rows(root / ROWS)
+        validate(chosen, store, options.workers)
+        table.write_anew()
+        return table
 
 
-def _jobs(
-    plan: StudyPlan, root: Path, store: Store, runs: list[Run], finished: list[Run], together: int
-) -> Iterator[Job]:
-    missing = [run for run in runs if run not in finished]
-    for _, group in groupby(missing, key=lambda run: (run.setting, run.is_reference, run.variant)):
-        seeds = list(group)
-        for first in range(0, len(seeds), together):
-            yield Job(plan, tuple(seeds[first : first + together]), root, store)
+def choose(runs: Sequence[Run], only: str) -> list[Run]:
+    """The runs whose `setting/variant/seed_N` fits a pattern of `only` or lies under it; without patterns, all."""
+    either = [pattern for one in only.split(",") for pattern in (one.strip(), f"{one.strip()}/*")]
+    chosen = [run for run in runs if not only or any(fnmatchcase(run.id, pattern) for pattern in either)]
+    if not chosen:
+        raise InputError(f"--only={only} fits no run; the first of the study is {runs[0].id}.")
+    return chosen
 
 
-def _execute(jobs: Iterator[Job], options: Options) -> Iterator[tuple[Run, list[Row]]]:
+def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
+    different = {run.artifact.digest: run for run in missing}.values()  # two names may be of one thing
+    for _, seeds in groupby(different, key=lambda run: id(run.arm)):
+        for some in batched(seeds, options.together):  # noqa: B911  the last one may be shorter
+            yield Job(some, store, root, options.workers)
+
+
+def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
     if options.executor == "processes":
         for job in jobs:
-            yield from execute(job)
+            yield from make_runs(job)
         return
     from concurrent.futures import as_completed
 
     with open_pool(options.executor, options.workers) as submit:
-        for future in as_completed([submit(_execute_whole, job) for job in jobs]):
+        for future in as_completed([submit(_make_all, job) for job in jobs]):
             yield from future.result()
 
 
-def _execute_whole(job: Job) -> list[tuple[Run, list[Row]]]:
-    import lerobot_constructskill.plugin  # noqa: F401  another machine has not registered the policy yet
+def _make_all(job: Job) -> list[Run]:
+    from lerobot.utils.import_utils import register_third_party_plugins
 
-    return list(execute(job))
-
-
-@contextmanager
-def _claimed(root: Path) -> Iterator[None]:
-    root.mkdir(parents=True, exist_ok=True)
-    with (root / ".lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise TakenError(f"Another process is running the study in {root} at this moment.") from None
-        yield
-
-
-def _write_plan(plan: StudyPlan, root: Path) -> None:
-    path = root / PLAN
-    if path.exists() and decode(StudyPlan, yaml.safe_load(path.read_text())).sha256 != plan.sha256:
-        raise InputError(f"{root} holds the results of another plan ({path}): name another folder for this one.")
-    with replaced(path) as partial:
-        partial.write_text(yaml.safe_dump(draccus.encode(plan), sort_keys=False))
-
-
-def _row_file(root: Path, run: Run) -> Path:
-    return root / "results" / run.id / ROWS
-
-
-def _is_finished(root: Path, run: Run, options: Options) -> bool:
-    path = _row_file(root, run)
-    return path.exists() and not (options.retry_failed and read_rows(path)["error"].notna().any())
-
-
-def _merge(root: Path, runs: list[Run]) -> None:
-    """Put the rows there are into the study's table, in the plan's order."""
-    merge_rows(filter(Path.exists, (_row_file(root, run) for run in runs)), root / ROWS)
+    register_third_party_plugins()  # another machine knows neither our policy nor other packages' yet
+    return list(make_runs(job))
 
 
 def _processor() -> str:
@@ -144,7 +106,7 @@ def _processor() -> str:
 def _wall_time(root: Path) -> float:
     """Seconds that earlier sessions of the study took, up to the last run that each finished."""
     path = root / PROVENANCE
-    return json.loads(path.read_text())["wall time, s"] if path.exists() else 0
+    return json.loads(path.read_text()).get("wall time, s", 0) if path.exists() else 0
 
 
 def _write_provenance(root: Path, seconds: float) -> None:

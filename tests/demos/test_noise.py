@@ -11,7 +11,7 @@ from lerobot_constructskill.demos.noise import NoiseConfig, execute
 COVARIANCE = np.array([[9.0, 3.0, 0.0], [3.0, 4.0, -1.0], [0.0, -1.0, 1.0]]) * 1e-6
 FITTED = COVARIANCE.tolist()
 MODELS = {
-    "none": (NoiseConfig("none"), np.zeros((3, 3))),
+    "off": (NoiseConfig(sigma=0.0), np.zeros((3, 3))),
     "fixed": (NoiseConfig("fixed", sigma=0.002), 4e-6 * np.eye(3)),
     "isotropic": (NoiseConfig("isotropic", covariance=FITTED), 14e-6 / 3 * np.eye(3)),
     "dart": (NoiseConfig("dart", covariance=FITTED), COVARIANCE),

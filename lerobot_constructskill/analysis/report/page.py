@@ -1,0 +1,146 @@
+"""A report's files: the page, its Markdown twin and the figures, from a study's folder."""
+
+import html
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from itertools import count
+from pathlib import Path
+
+import draccus
+import pandas as pd
+import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from lerobot_constructskill.analysis.report import figures, wording
+from lerobot_constructskill.analysis.report.answer import answer, status
+from lerobot_constructskill.analysis.report.collect import collect
+from lerobot_constructskill.analysis.report.findings import Findings, SettingFindings
+from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
+from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
+from lerobot_constructskill.analysis.section import Analysis
+from lerobot_constructskill.analysis.stats.power import seeds_needed, wrong_order
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, read_rows
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+MARKDOWN = "\\`*_[]|"
+"""Characters that a backslash makes plain in Markdown."""
+
+WORDS = (
+    *(wording.chance, wording.p_value, wording.percent, wording.rare, wording.share_range, wording.signed),
+    *(wording.points, wording.points_range, wording.mean_episodes, wording.episodes_range, wording.error_range),
+    *(wording.plural, wording.seeds),
+)
+"""What templates may call as filters."""
+
+
+@dataclass(frozen=True)
+class Heading:
+    """What a report reads of a study's file: it takes everything else from the rows."""
+
+    name: str
+    analysis: Analysis = field(default_factory=Analysis)
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """One setting of the page."""
+
+    setting: SettingFindings
+    paragraph: str
+    pictures: dict[str, Picture]
+    films: list[Film]
+
+
+def write_report(root: Path) -> Path:
+    """Write report.html, report.md and figures/ into a study's folder and return the page.
+
+    Raises:
+        MissingError: study.yaml or rows.parquet is not there.
+        InputError: one of them cannot be read, or they do not belong together.
+    """
+    heading, rows = read_study(root)
+    (root / "figures").mkdir(exist_ok=True)
+    findings = collect(heading.analysis, rows)
+    context = {
+        "name": heading.name,
+        "study": (root / STUDY).read_text(),
+        "findings": findings,
+        "status": status(findings),
+        "sections": _sections(root, findings, rows),
+        "power": picture(figures.detectable_figure(findings), root / "figures"),
+        "facts": [*provenance(rows), *extra_facts(root / PROVENANCE)],
+        "version": metadata.version("lerobot_env_constructskill"),
+    }
+    for file, environment in (("report.md", _environment(finalize=_escape_markdown)), ("report.html", _environment())):
+        (root / file).write_text(environment.get_template(file).render(numbers=_numbers(), **context))
+    return root / "report.html"
+
+
+def read_study(root: Path) -> tuple[Heading, pd.DataFrame]:
+    """Read what a report takes of a study's file, and its rows. Raises as `write_report` does."""
+    for name in (STUDY, ROWS):
+        if not (root / name).is_file():
+            raise MissingError(f"'{root}' is no folder of a study: {name} is missing.")
+    return _read_heading(root / STUDY), read_rows(root / ROWS)
+
+
+def _read_heading(path: Path) -> Heading:
+    try:
+        study = yaml.safe_load(path.read_text())
+        if not isinstance(study, dict):
+            raise InputError("it holds no mapping of fields.")
+        known = {key: study[key] for key in ("name", "analysis") if study.get(key) is not None}
+        return draccus.decode(Heading, known)
+    except (InputError, yaml.YAMLError, draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
+        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error  # draccus tells its own alone
+        raise InputError(f"'{path}' is not a study's file: {reason}") from None
+
+
+def _sections(root: Path, findings: Findings, rows: pd.DataFrame) -> list[Section]:
+    return [
+        Section(setting, paragraph, _pictures(setting, findings.episodes, root), films(root, setting, rows))
+        for setting, (_, paragraph) in zip(findings.settings, answer(findings), strict=True)
+    ]
+
+
+def _pictures(setting: SettingFindings, episodes: int, root: Path) -> dict[str, Picture]:
+    drawings: dict[str, Drawing | None] = {
+        "outcomes": figures.outcome_figure(setting),
+        "seeds": figures.grid_figure(setting, episodes),
+        "error": figures.error_figure(setting, episodes),
+        "ranking": figures.ranking_figure(setting),
+    }
+    return {name: picture(drawing, root / "figures") for name, drawing in drawings.items() if drawing is not None}
+
+
+def _numbers() -> Iterator[str]:
+    """Roman numerals for tables, one at every `numbers | next`."""
+    return (wording.roman(number) for number in count(1))
+
+
+def _environment(**options) -> Environment:
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        **options,
+    )
+    environment.filters |= {word.__name__: word for word in WORDS}
+    environment.filters |= {"next": next, "link": Markup}  # a link's path is quoted for URLs already
+    environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed}
+    return environment
+
+
+def _escape_markdown(value: object) -> object:
+    """Text that neither Markdown nor the HTML that Markdown lets through reads as anything but text, on one line."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    text = html.escape(" ".join(value.split()), quote=False)
+    return Markup("".join(f"\\{character}" if character in MARKDOWN else character for character in text))

@@ -1,0 +1,62 @@
+"""How a study is to be read: the `analysis` section of its file, which decides nothing that is run."""
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from itertools import chain
+
+from lerobot_constructskill.errors import InputError
+
+
+@dataclass(frozen=True)
+class Analysis:
+    """Labels, order and tests of a report.
+
+    Args:
+        labels: name of a setting, variant or reference to what tables call it; the name itself by default.
+        order: variants that stand first, in this order; the others follow as they stand in the study.
+        comparisons: pairs of variants that the study declares it will test, the family that Holm's correction covers;
+            every pair with equally many planned seeds by default.
+        alpha: level of those tests.
+
+    Raises:
+        InputError: no such tests can be made.
+    """
+
+    labels: dict[str, str] = field(default_factory=dict)
+    order: list[str] = field(default_factory=list)
+    comparisons: list[list[str]] | None = None
+    alpha: float = 0.05
+
+    def __post_init__(self):
+        if not 0 < self.alpha < 1:
+            raise InputError(f"alpha must lie between 0 and 1, not {self.alpha}.")
+        for pair in self.comparisons or []:
+            if len(pair) != 2 or pair[0] == pair[1]:
+                raise InputError(f"A comparison is a pair of variants, not {pair}.")
+
+    def check(self, variants: Collection[str], others: Collection[str] = ()) -> None:
+        """Refuse names that the study does not have.
+
+        Args:
+            variants: names that everything here may use.
+            others: those of settings and references, which may have labels.
+
+        Raises:
+            InputError: a name is unknown.
+        """
+        _check_known("variant in comparisons", chain.from_iterable(self.comparisons or []), variants)
+        _check_known("variant in order", self.order, variants)
+        _check_known("name in labels", self.labels, [*variants, *others])
+
+    def label(self, name: str) -> str:
+        return self.labels.get(name, name)
+
+    def rank(self, variant: str) -> int:
+        """Where a variant stands; equal for those that `order` does not name."""
+        return self.order.index(variant) if variant in self.order else len(self.order)
+
+
+def _check_known(what: str, given: Iterable[str], known: Collection[str]) -> None:
+    for name in given:
+        if name not in known:
+            raise InputError(f"Unknown {what} '{name}'; there are: {', '.join(known)}.")

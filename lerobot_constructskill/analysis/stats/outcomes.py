@@ -1,0 +1,61 @@
+"""From episodes to seeds: what a training run achieved, and how many runs met a criterion.
+
+The seed is the sample. Episodes are counted within their run and never pooled over runs: with a fixed spawn the
+episodes of a run repeat one trajectory (paper, section III).
+"""
+
+from typing import NamedTuple
+
+import pandas as pd
+
+from lerobot_constructskill.study.rows import NOT_RUN
+
+CRITERIA = ("lifted", "placed")
+"""The two success metrics of an episode, each a column of the rows."""
+
+RUN = ["setting", "variant", "training_seed"]
+"""Columns that tell one run from another."""
+
+
+class Counts(NamedTuple):
+    """Seeds that met a criterion, out of all seeds; failed runs are among `seeds` and not among `met`."""
+
+    met: int
+    seeds: int
+
+    @property
+    def rate(self) -> float:
+        return self.met / self.seeds
+
+
+def seed_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
+    """One line for every run that was made, ordered by setting, variant and seed.
+
+    Args:
+        rows: one line per evaluation episode, as `study.rows.read_rows` returns them.
+
+    Returns:
+        The columns of `RUN`; `episodes` that were run; `lifted` and `placed`, episodes that met the criterion;
+        `lifted_rate` and `placed_rate`, their share in [0, 1], 0 where the run failed; `heldout_mse_m2`;
+        `heldout_mse_m2_by_data`, as in the rows; `error_kind` and `error` of a failed run, else null.
+    """
+    made = rows[rows["error_kind"].fillna("") != NOT_RUN]
+    groups = made.groupby(RUN, sort=True)
+    runs = pd.DataFrame({"episodes": groups["placed"].count()})
+    for criterion in CRITERIA:
+        runs[criterion] = groups[criterion].sum().astype(int)
+        runs[f"{criterion}_rate"] = (runs[criterion] / runs["episodes"].clip(lower=1)).astype(float)
+    runs["heldout_mse_m2"] = groups["heldout_mse_m2"].first().astype(float)
+    for column in ("heldout_mse_m2_by_data", "error_kind", "error"):
+        runs[column] = groups[column].first()
+    return runs.reset_index()
+
+
+def count(runs: pd.DataFrame, criterion: str) -> Counts:
+    """Count the runs with at least one episode that met `criterion` (paper, Table I).
+
+    Args:
+        runs: lines of `seed_outcomes`.
+        criterion: one of `CRITERIA`.
+    """
+    return Counts(int((runs[criterion] > 0).sum()), len(runs))

@@ -1,0 +1,73 @@
+"""What a number of seeds can show: power, the smallest difference that shows, wrong orders, seeds needed."""
+
+from bisect import bisect_left
+from functools import cache, partial
+from math import ceil, sqrt
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.stats import binom
+from statsmodels.stats.power import normal_sample_size_one_tail
+from statsmodels.stats.proportion import proportion_effectsize
+
+from lerobot_constructskill.analysis.stats.comparisons import fisher
+from lerobot_constructskill.analysis.stats.outcomes import Counts
+
+TARGET = 0.8
+"""The power that a study is planned for."""
+
+
+def wrong_order(rate_a: float, rate_b: float, seeds: int) -> float:
+    """Chance that of two variants of these true rates the worse one succeeds in more of `seeds` seeds each."""
+    joint = _joint(max(rate_a, rate_b), min(rate_a, rate_b), seeds)
+    return float(np.triu(joint, 1).sum())
+
+
+def power(rate_a: float, rate_b: float, seeds: int, alpha: float = 0.05) -> float:
+    """Probability that Fisher's two-tailed test with `seeds` seeds an arm tells these rates apart, exactly.
+
+    Boschloo's has more; Fisher's is the one whose whole rejection region is quickly had.
+    """
+    return float(_joint(rate_a, rate_b, seeds)[_rejected(seeds, alpha)].sum())
+
+
+def detectable_difference(rate: float, seeds: int, alpha: float = 0.05) -> float | None:
+    """The smallest drop from `rate` that `seeds` seeds an arm show with 80 % power; None where even a drop to 0 hides.
+
+    A rise from 1 - `rate` is as hard to see.
+    """
+    if power(rate, 0.0, seeds, alpha) < TARGET:
+        return None
+    return float(brentq(lambda drop: power(rate, rate - drop, seeds, alpha) - TARGET, 0.0, rate, xtol=1e-4))
+
+
+def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> int | None:
+    """Seeds an arm that tell these rates apart with 80 % power; None where they are equal.
+
+    From the normal approximation on arcsine-transformed rates (Cohen 1988, section 6.4); an exact test needs a few
+    more.
+    """
+    if rate_a == rate_b:
+        return None
+    effect = proportion_effectsize(rate_a, rate_b)  # its estimate from n seeds an arm has the deviation sqrt(2 / n)
+    return max(2, ceil(normal_sample_size_one_tail(effect, TARGET, alpha / 2, std_null=sqrt(2))))
+
+
+def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
+    """Probability of every pair of counts, (seeds + 1, seeds + 1)."""
+    counts = np.arange(seeds + 1)
+    return np.outer(binom.pmf(counts, seeds, rate_a), binom.pmf(counts, seeds, rate_b))
+
+
+@cache
+def _rejected(seeds: int, alpha: float) -> np.ndarray:
+    """Which pairs of counts Fisher's test rejects, bool (seeds + 1, seeds + 1)."""
+    rejected = np.zeros((seeds + 1, seeds + 1), dtype=bool)
+    for a in range(seeds + 1):
+        # The closer b comes to a, the larger is p.
+        rejected[a, : bisect_left(range(a), True, key=partial(_kept, a, seeds=seeds, alpha=alpha))] = True
+    return rejected | rejected.T
+
+
+def _kept(a: int, b: int, seeds: int, alpha: float) -> bool:
+    return fisher(Counts(a, seeds), Counts(b, seeds)) >= alpha

@@ -1,0 +1,49 @@
+"""SHA-256 of specifications, files and data sets, and the versions that a digest depends on. Standard library only."""
+
+import hashlib
+import json
+from functools import cache
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from pathlib import Path
+from typing import Any
+
+
+def digest(spec: Any) -> str:
+    """The first 16 hexadecimal digits of the hash of plain values, whatever the order of their names."""
+    return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def file_sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def data_sha256(root: Path) -> str:
+    """Hash the frames and videos of a data set: relative paths and bytes, in the order of the paths."""
+    total = hashlib.sha256()
+    for path in sorted(p for folder in ("data", "videos") for p in (root / folder).rglob("*") if p.is_file()):
+        total.update(path.relative_to(root).as_posix().encode())
+        total.update(bytes.fromhex(file_sha256(path)))
+    return total.hexdigest()
+
+
+@cache
+def installed(package: str) -> str | None:
+    """The version of an installed package; None where it is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Those of some packages that are installed, with their versions."""
+    return {package: found for package in packages if (found := installed(package))}
+
+
+def distributions_of(thing: Any) -> tuple[str, ...]:
+    """The installed distributions that a class or function comes from."""
+    return tuple(_distributions().get(thing.__module__.split(".")[0], ()))
+
+
+_distributions = cache(packages_distributions)

@@ -1,0 +1,94 @@
+"""A data set's card: its README.md on the Hub, rendered from the data and the contract table."""
+
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task, held_out
+from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.expert import Phase
+
+MEANINGS = {
+    "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",
+    "action": "displacement asked for in a step, m, robot's base frame, x forward, z up; gripper +1 open, -1 closed",
+    "dart.executed_action": "what was executed: the clean action and the noise, clipped",
+    "dart.noise": "executed minus clean translation, m",
+    "phase": "the expert's phase of this action",
+    "sim.tcp_pose": "privileged: end effector, position (m) and quaternion (w, x, y, z), world frame",
+    "sim.fingers": "privileged: finger positions, m",
+    "sim.object_pose": "privileged: object, position (m) and quaternion (w, x, y, z), world frame",
+    "sim.object_size": "privileged: object's edges, m",
+    "sim.object_mass": "privileged: object's mass, kg",
+    "sim.bin_position": "privileged: centre of the bin's interior, m, world frame",
+    "sim.bin_interior": "privileged: the bin's inner edges, m",
+    "sim.seed": "seed of the episode's initial state and noise",
+    "next.reward": "stage reached after the action: 0, 0.5 lifted, 1 placed",
+    "next.success": "whether the object is placed after the action",
+    "next.done": "whether the episode ends with the action",
+}
+
+
+def card_facts(data: DataSet) -> dict[str, Any]:
+    """The facts of a card: plain values, so that they can be kept beside it and compared with the data later."""
+    lengths = [span.stop - span.start for span in data.spans()]
+    phases, noise = data.column("phase"), data.column("dart.noise")
+    base = data.column("sim.tcp_pose")[0, :3] - data.column("observation.state")[0, :3]
+    return {
+        "repo_id": data.config.repo_id,
+        "generator": data.facts["generator"],
+        "noise_covariance": data.facts["noise_covariance"],
+        "versions": data.facts["versions"],
+        "attempts": data.facts["attempts"],
+        "discarded_seeds": data.facts["discarded_seeds"],
+        "episodes": len(lengths),
+        "frames": len(data.rows),
+        "shortest": min(lengths),
+        "longest": max(lengths),
+        "held_out": held_out(len(lengths)),
+        "robot_base": [round(float(value), 3) + 0.0 for value in base],
+        "phases": {
+            str(phase): {
+                "frames": int((phases == phase).sum()),
+                "noise_mm": [round(1000 * float(value), 2) for value in noise[phases == phase].std(axis=0)],
+            }
+            for phase in Phase
+        },
+        "action_range": {
+            name: [round(float(data.stats["action"][edge][index]), 4) for edge in ("q01", "q99")]
+            for index, name in enumerate(data.info["features"]["action"]["names"])
+        },
+    }
+
+
+def render(facts: dict[str, Any]) -> str:
+    """The card of a data set with these facts, in Markdown with the Hub's front matter."""
+    from jinja2 import Environment, StrictUndefined
+
+    task = get_task(facts["generator"]["task"])
+    features = demonstration_features(task, facts["generator"]["obs_type"])
+    cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
+    sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
+    template = files(__package__).joinpath("card.md.j2").read_text()
+    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
+    return environment.from_string(template).render(
+        **facts,
+        task=task,
+        fps=FPS,
+        seed_start=DEMO_SEED_START,
+        cameras=cameras,
+        features={name: feature for name, feature in features.items() if name in MEANINGS},
+        meanings=MEANINGS,
+        sigma_mm=[round(float(value), 2) for value in sigma],
+        rename_map=_rename_map([camera.key for camera in cameras]),
+    )
+
+
+def _rename_map(keys: list[str]) -> dict[str, str]:
+    """Our cameras under the names that SmolVLA's and pi0's base models expect."""
+    import json
+
+    smolvla = {key: f"observation.images.camera{index + 1}" for index, key in enumerate(keys)}
+    pi0 = dict(zip(keys, ("observation.images.base_0_rgb", "observation.images.left_wrist_0_rgb"), strict=False))
+    return {"smolvla": json.dumps(smolvla), "pi0": json.dumps(pi0)}

@@ -1,0 +1,264 @@
+"""What a data set of demonstrations owes: each check takes it as tables and yields a sentence for each thing wrong.
+
+`CHECKS` names them. Noise is not judged by its spread alone: it is a function of the seed, so it is drawn again.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from lerobot_constructskill.contract import (
+    ACTION_SCALE,
+    DEMO_SEED_START,
+    FPS,
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    REWARD_LIFTED,
+    REWARD_PLACED,
+    get_task,
+)
+from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.dataset.frames import FRAME_CHECKS
+from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.expert import Phase
+from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.demos.merge import frame_statistics
+from lerobot_constructskill.demos.modality import MODALITY
+from lerobot_constructskill.demos.noise import execute
+from lerobot_constructskill.demos.settings import FRAME_PACKAGES
+from lerobot_constructskill.errors import UserError
+
+type Check = Callable[[DataSet], Iterator[str]]
+
+BOOKKEEPING = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+REACH = 1.2
+"""Farthest that the Panda's end effector gets from its base, in metres."""
+
+RESPONSE = (0.15, 0.8)
+"""Displacement of the end effector for each metre asked for; the simulated arm moves 0.30 to 0.36."""
+
+HARDLY_ASKED = 0.1
+"""An axis that is asked for less than this share of the strongest one moves by the arm's sag: no response to judge."""
+
+
+def check_files(data: DataSet) -> Iterator[str]:
+    recorded, found = data.facts["sha256"], file_hashes(data.root)
+    for name in sorted(recorded.keys() - found.keys()):
+        yield f"{name} is missing."
+    for name in sorted(found.keys() - recorded.keys()):
+        yield f"{name} was added after the generation."
+    for name in sorted(name for name in recorded.keys() & found.keys() if recorded[name] != found[name]):
+        yield f"{name} is not the file that was generated: its SHA-256 differs."
+
+
+def check_schema(data: DataSet) -> Iterator[str]:
+    task, features = get_task(data.config.task), data.info["features"]
+    wanted = demonstration_features(task, data.config.obs_type)
+    for name in sorted(wanted.keys() - features.keys()):
+        yield f"info.json has no feature {name}."
+    for name in sorted(features.keys() - wanted.keys() - BOOKKEEPING):
+        yield f"info.json has the feature {name}, which is not of the contract and which a policy may read."
+    for name in wanted.keys() & features.keys():
+        for part in ("dtype", "shape", "names"):
+            if _plain(features[name][part]) != _plain(wanted[name][part]):
+                yield f"{name} has {part} {features[name][part]}, not {wanted[name][part]}."
+    stored = {name for name, feature in wanted.items() if feature["dtype"] != "video"} | BOOKKEEPING
+    for name in sorted(stored ^ set(data.rows.columns)):
+        yield f"data/ {'has no' if name in stored else 'has an unknown'} column {name}."
+    if data.info["fps"] != FPS:
+        yield f"info.json says {data.info['fps']} frames a second, not {FPS}."
+    if data.tasks != [task.instruction]:
+        yield f"The instruction is {data.tasks}, not '{task.instruction}'."
+
+
+def check_values(data: DataSet) -> Iterator[str]:
+    for name, feature in data.info["features"].items():
+        if feature["dtype"] == "float32":
+            finite = np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
+            if not finite.all():
+                yield f"{name} is not finite in {(~finite).sum()} frames."
+    limits = {"action": ACTION_SCALE, "dart.executed_action": data.config.noise.clip}
+    for name, limit in limits.items():
+        largest = np.abs(data.column(name)[:, :-1]).max()
+        if largest > limit + 1e-6:
+            yield f"{name} reaches {largest:.4g} where {limit} m a step is the most: these are other units."
+        odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED))
+        if odd.any():
+            yield f"{name} has a gripper that is neither +1 nor -1 in {odd.sum()} frames."
+    state = data.column("observation.state")
+    if np.linalg.norm(state[:, :3], axis=1).max() > REACH:
+        yield f"observation.state has positions beyond the robot's reach of {REACH} m."
+    if not ((state[:, 6:] > -0.001) & (state[:, 6:] < 0.041)).all():
+        yield "observation.state has finger positions outside 0 to 0.04 m."
+    if not np.isin(data.column("next.reward"), (0, REWARD_LIFTED, REWARD_PLACED)).all():
+        yield f"next.reward is not one of 0, {REWARD_LIFTED} and {REWARD_PLACED} everywhere."
+
+
+def check_units(data: DataSet) -> Iterator[str]:
+    """The arm answers a command in metres and in the base frame: its displacement is a part of it, with its sign."""
+    executed, position = data.column("dart.executed_action")[:, :3], data.column("observation.state")[:, :3]
+    inner = (np.diff(data.column("episode_index")) == 0) & (np.abs(executed[:-1]).max(axis=1) > 0)
+    asked, moved = executed[:-1][inner], np.diff(position, axis=0)[inner]
+    strength = np.sqrt((asked**2).mean(axis=0))
+    for axis, name in enumerate("xyz"):
+        if strength[axis] < HARDLY_ASKED * strength.max():
+            continue
+        response = asked[:, axis] @ moved[:, axis] / (asked[:, axis] @ asked[:, axis] + 1e-12)
+        if not RESPONSE[0] <= response <= RESPONSE[1]:
+            low, high = RESPONSE
+            yield f"The end effector moves {response:.3g} m in {name} for a metre asked for, not {low} to {high} m."
+
+
+def check_noise(data: DataSet) -> Iterator[str]:
+    config = data.config
+    executed, added = data.column("dart.executed_action"), data.column("dart.noise")
+    clean = executed.copy()
+    clean[:, :3] -= added
+    wanted = clean if config.labels == "clean" else executed
+    if np.abs(data.column("action") - wanted).max() > 1e-6:
+        yield f"action is not the {config.labels} action that the provenance says its labels are."
+    phases, seeds = data.column("phase"), data.column("sim.seed")
+    drawn = np.empty_like(executed)
+    for span in data.spans():
+        rng = np.random.default_rng(int(seeds[span.start]))
+        for row in range(span.start, span.stop):
+            drawn[row] = execute(clean[row], phases[row], config.noise, rng)
+    for phase in Phase:
+        rows = phases == phase
+        off = np.abs(drawn - executed)[rows].max(initial=0)
+        if off > 1e-6:
+            spread = ", ".join(f"{1000 * value:.1f}" for value in added[rows].std(axis=0))
+            model = config.noise.model
+            yield f"The noise in {phase} (std {spread} mm) is not what the {model} model draws from the seed."
+
+
+def check_episodes(data: DataSet) -> Iterator[str]:
+    spans, rows = data.spans(), len(data.rows)
+    indices = [int(data.column("episode_index")[span.start]) for span in spans]
+    if indices != list(range(len(data.episodes))):
+        yield f"The rows hold episodes {_few(indices)}, the metadata {len(data.episodes)}."
+    for span, (_, episode) in zip(spans, data.episodes.iterrows(), strict=False):
+        yield from _check_episode(data, span, f"Episode {episode['episode_index']}", episode)
+    if not np.array_equal(data.column("index"), np.arange(rows)):
+        yield "index does not count the frames of the data set one by one."
+    for name, count in (("total_episodes", len(spans)), ("total_frames", rows)):
+        if data.info[name] != count:
+            yield f"info.json says {name} is {data.info[name]}, but there are {count}."
+
+
+def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[str]:
+    length = span.stop - span.start
+    if not np.array_equal(data.column("frame_index")[span], np.arange(length)):
+        yield f"{who} has a gap: frame_index does not count its {length} frames."
+    if (episode["dataset_from_index"], episode["dataset_to_index"]) != (span.start, span.stop):
+        yield f"{who} has rows {span.start} to {span.stop}, its metadata say otherwise."
+    if len(set(data.column("sim.seed")[span])) > 1:
+        yield f"{who} has frames of several seeds."
+    if list(dict.fromkeys(data.column("phase")[span])) != list(Phase):
+        yield f"{who} does not go through the six phases in order."
+    done, success = data.column("next.done")[span], data.column("next.success")[span]
+    if done[:-1].any() or not (done[-1] and success[-1]):
+        yield f"{who} does not end in success, or ends before its last frame."
+
+
+def check_timestamps(data: DataSet) -> Iterator[str]:
+    off = np.abs(data.column("timestamp") - data.column("frame_index") / FPS)
+    if off.max() > 1e-4:
+        yield f"{(off > 1e-4).sum()} time stamps are not frame_index / {FPS}, the worst by {off.max():.4f} s."
+
+
+def check_duplicates(data: DataSet) -> Iterator[str]:
+    """Noisy demonstrations never repeat one another; frames never stand still while a moving arm is told to move."""
+    if data.config.noise.root.any():
+        seen: dict[bytes, int] = {}
+        for episode, span in enumerate(data.spans()):
+            first = seen.setdefault(data.column("dart.executed_action")[span].tobytes(), episode)
+            if first != episode:
+                yield f"Episode {episode} repeats episode {first}."
+    state, asked = data.column("observation.state"), np.abs(data.column("dart.executed_action")[:, :3]).max(axis=1)
+    still = (np.diff(state, axis=0) == 0).all(axis=1) & (np.diff(data.column("episode_index")) == 0)
+    frozen = still & (asked[:-1] > 0.005)
+    if frozen.any():
+        first = frozen.argmax() + 1
+        yield f"{frozen.sum()} frames repeat the one before although the arm was told to move, first {first}."
+
+
+def check_hold_out(data: DataSet) -> Iterator[str]:
+    """Holding out whole episodes separates seeds: no seed makes two episodes, and none is an evaluation's."""
+    seeds = data.column("sim.seed")[[span.start for span in data.spans()]]
+    values, counts = np.unique(seeds, return_counts=True)
+    if (counts > 1).any():
+        yield f"Seeds {_few(values[counts > 1])} made several episodes, so holding one out does not hold it out."
+    if values.min() < min(DEMO_SEED_START, data.config.seed_start):
+        yield f"Seeds {_few(values[values < DEMO_SEED_START])} are below {DEMO_SEED_START}: evaluations use those."
+
+
+def check_statistics(data: DataSet) -> Iterator[str]:
+    for name, wanted in frame_statistics(data.root).items():
+        for statistic, value in wanted.items():
+            found = data.stats.get(name, {}).get(statistic)
+            if found is None:
+                yield f"stats.json has no {statistic} of {name}."
+            elif not np.allclose(found, value, rtol=1e-4, atol=1e-6):
+                yield f"stats.json has {statistic} {found} of {name}; of the frames it is {value.tolist()}."
+    for camera in data.cameras:
+        if not {"mean", "std", "q01", "q99"} <= data.stats.get(camera, {}).keys():
+            yield f"stats.json lacks the mean, std or quantiles of {camera}."
+
+
+def check_provenance(data: DataSet) -> Iterator[str]:
+    discarded = data.facts["discarded_seeds"]
+    seeds = data.column("sim.seed")[[span.start for span in data.spans()]].tolist()
+    wanted = list(range(data.config.seed_start, data.config.seed_start + data.facts["attempts"]))
+    if sorted([*seeds, *discarded]) != wanted:
+        yield "The seeds of the episodes and the discarded ones are not those of the attempts, one by one."
+    if seeds != sorted(seeds):
+        yield "The episodes are not in the order of their seeds."
+    missing = set(FRAME_PACKAGES) - data.facts["versions"].keys()
+    if missing:
+        yield f"The versions of {', '.join(sorted(missing))} are not recorded."
+    if data.facts["generator"]["light_robot"] is None:
+        yield "Whether the light robot was drawn is not recorded."
+    if not (data.root / MODALITY).is_file():
+        yield f"{MODALITY} is missing."
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _few(values) -> str:
+    values = [int(value) for value in values]
+    return ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
+
+
+CHECKS: dict[str, Check] = {
+    "Files": check_files,
+    "Schema": check_schema,
+    "Values": check_values,
+    "Units": check_units,
+    "Noise": check_noise,
+    "Episodes": check_episodes,
+    "Time stamps": check_timestamps,
+    **FRAME_CHECKS,
+    "Duplicates": check_duplicates,
+    "Hold-out": check_hold_out,
+    "Statistics": check_statistics,
+    "Provenance": check_provenance,
+}
+
+
+def complaints(data: DataSet, check: Check) -> list[str]:
+    """What `check` finds wrong, the first few things; also where it cannot look because something is not there.
+
+    A check may rely on the schema. Where that is right, what a check itself raises is an error of the check.
+    """
+    try:
+        found = list(check(data))
+    except UserError as error:
+        return [f"Cannot be checked: {error}"]
+    except Exception:
+        if check is check_schema or not complaints(data, check_schema):
+            raise
+        return ["Cannot be checked while the schema is wrong."]
+    return found[:3] + [f"And {len(found) - 3} more like these."] * (len(found) > 3)

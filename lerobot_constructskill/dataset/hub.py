@@ -1,0 +1,149 @@
+"""Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
+
+LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
+
+
+def locate(repo_id: str | None, root: Path | None, revision: str | None = None) -> Path:
+    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else what the Hub has.
+
+    Raises:
+        ValueError: neither a name nor a folder was given.
+        FileNotFoundError: the folder, or the data set on the Hub, is not there.
+    """
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    if root is not None:
+        if not root.is_dir():
+            raise MissingError(f"There is no folder {root}.")
+        return root
+    if repo_id is None:
+        raise InputError("Name a data set with --repo_id, or its folder with --root.")
+    if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
+        return HF_LEROBOT_HOME / repo_id
+    return pull(repo_id, revision)
+
+
+def pull(repo_id: str, revision: str | None = None) -> Path:
+    """Bring a revision (LeRobot's version tag by default) into LeRobot's cache, or find it there without a network.
+
+    Raises:
+        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
+    """
+    from huggingface_hub import snapshot_download
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+    from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+
+    revision = revision or CODEBASE_VERSION
+    with one_sentence(repo_id, revision):
+        folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
+    return Path(folder)
+
+
+def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
+    """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
+
+    Raises:
+        FileNotFoundError: there is no data set in `root`.
+        ValueError: a file of it cannot be read.
+        OSError: the Hub does not have it, or cannot be reached.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_constructskill.dataset.dataset import check_is_there
+
+    if root is not None:
+        check_is_there(root)
+    try:
+        with one_sentence(repo_id, revision):
+            return LeRobotDataset(repo_id, root=root, revision=revision)
+    except (ValueError, LookupError) as error:
+        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({error}).") from error
+
+
+@contextmanager
+def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
+    """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
+    import httpx
+    from huggingface_hub.errors import HFValidationError
+
+    try:
+        yield
+    except (OSError, RuntimeError, HFValidationError, httpx.HTTPError) as error:
+        # An upload's own error is the cause of a bare RuntimeError.
+        reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
+        if reason is None:
+            raise
+        raise MachineError(reason) from None
+
+
+def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
+    import httpx
+    from huggingface_hub import errors
+
+    if isinstance(error, errors.RevisionNotFoundError):
+        return f"'{repo_id}' has no revision '{revision}' on the Hub."
+    if isinstance(error, errors.RepositoryNotFoundError):
+        return f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
+    if isinstance(error, errors.LocalEntryNotFoundError):
+        return f"The Hub cannot be reached and revision '{revision}' of '{repo_id}' is not in the cache."
+    if isinstance(error, errors.OfflineModeIsEnabled):
+        return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
+    if isinstance(error, errors.HfHubHTTPError):
+        return _refusal(repo_id, error.response.status_code)
+    if isinstance(error, errors.HFValidationError):
+        return f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."
+    if isinstance(error, httpx.ConnectError):
+        return f"The Hub cannot be reached for '{repo_id}'."
+    if isinstance(error, httpx.HTTPError):
+        return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
+    return None
+
+
+def _refusal(repo_id: str, status: int | None) -> str:
+    if status == 401:
+        return f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"
+    if status == 403:
+        return f"The token of this machine may not write to '{repo_id}': use a name of your own."
+    return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."
+
+
+def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
+    """Put the folder of a data set on the Hub, in one commit, and tag it; return the commit's address.
+
+    Interrupted, the same call continues: the Hub keeps the files that arrived. The tag is set last, so what has one is
+    whole.
+
+    Args:
+        tag: a version of the data set, beside LeRobot's own tag, without which LeRobot loads nothing.
+        update: replace a data set that is whole, and move its tags.
+
+    Raises:
+        FileExistsError: the name holds a whole data set and `update` is not set.
+        OSError: the Hub cannot be reached, or refuses the token or the name.
+    """
+    from huggingface_hub import HfApi
+    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+
+    api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
+    with one_sentence(repo_id):
+        api.create_repo(**repo, private=private, exist_ok=True)
+        tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
+        if CODEBASE_VERSION in tagged and not update:
+            raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
+        stale = ["data/*", "videos/*", "meta/*"]
+        commit = api.upload_folder(**repo, folder_path=root, ignore_patterns=[".cache/*"], delete_patterns=stale)
+        for name in filter(None, (CODEBASE_VERSION, tag)):
+            if name in tagged:
+                api.delete_tag(**repo, tag=name)
+            api.create_tag(**repo, tag=name)
+    return commit.commit_url

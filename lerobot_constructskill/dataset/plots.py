@@ -1,0 +1,73 @@
+"""Two pictures of a data set: what its phases look like, and where its end effector went."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.dataset.frames import pictures
+from lerobot_constructskill.demos.expert import Phase
+
+COLOURS = dict(zip(Phase, ("#0072B2", "#56B4E9", "#000000", "#E69F00", "#D55E00", "#009E73"), strict=True))
+"""Okabe and Ito's, which colour-blind readers tell apart."""
+
+SHEET_EPISODES, PATH_EPISODES = 3, 20
+
+
+def contact_sheet(data: DataSet, path: Path) -> None:
+    """A row for each of the first episodes and cameras: the start of each phase, and the last frame."""
+    spans = data.spans()[:SHEET_EPISODES]
+    phases = data.column("phase")
+    wanted = [
+        [*(span.start + int(np.argmax(phases[span] == phase)) for phase in Phase), span.stop - 1] for span in spans
+    ]
+    lines = [(camera, rows) for rows in wanted for camera in data.cameras]
+    shown = {camera: _frames(data, camera, {row for rows in wanted for row in rows}) for camera in data.cameras}
+    figure = Figure(figsize=(1.6 * len(wanted[0]), 1.75 * len(lines)), layout="constrained")
+    axes = figure.subplots(len(lines), len(wanted[0]), squeeze=False)
+    for index, (camera, rows) in enumerate(lines):
+        for axis, row, title in zip(axes[index], rows, [*Phase, "last frame"], strict=True):
+            axis.imshow(shown[camera][row])
+            axis.set(xticks=[], yticks=[])
+            if index == 0:
+                axis.set_title(title, fontsize=9, color=COLOURS.get(title, "black"))
+        axes[index, 0].set_ylabel(f"{camera.split('.')[-1]}, episode {index // len(data.cameras)}", fontsize=8)
+    _save(figure, path)
+
+
+def trajectories(data: DataSet, path: Path) -> None:
+    """Paths of the first episodes' end effector from above and from the side, coloured by phase, with the bin."""
+    position, phases = data.column("sim.tcp_pose")[:, :3], data.column("phase")
+    spans = data.spans()[:PATH_EPISODES]
+    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    for axis, (across, up), title in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "side"), strict=True):
+        center, extent = data.column("sim.bin_position")[0], data.column("sim.bin_interior")[0]
+        corner = [center[i] - extent[i] / 2 for i in (across, up)]
+        axis.add_patch(Rectangle(corner, extent[across], extent[up], facecolor="#dddddd", label="bin"))
+        for span in spans:
+            for start in range(span.start, span.stop - 1):
+                piece = position[start : start + 2]
+                axis.plot(piece[:, across], piece[:, up], color=COLOURS[Phase(phases[start])], linewidth=0.7)
+        axis.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal", adjustable="datalim")
+        axis.set_title(f"{title}, {len(spans)} of {len(data.episodes)} demonstrations", fontsize=10)
+    for phase, colour in COLOURS.items():
+        axis.plot([], [], color=colour, label=phase)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
+    _save(figure, path)
+
+
+def _frames(data: DataSet, camera: str, rows: set[int]) -> dict[int, np.ndarray]:
+    found = {}
+    for row, picture in pictures(data, camera):
+        if row in rows:
+            found[row] = picture
+        if len(found) == len(rows):
+            break
+    return found
+
+
+def _save(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

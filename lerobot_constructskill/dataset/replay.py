@@ -1,0 +1,43 @@
+"""Executes a recorded demonstration again, in a simulator of its own as when it was recorded."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What came of one episode's executed actions.
+
+    Args:
+        same_outcome: reward and success are as recorded at every step.
+        deviation: largest difference of any number of `observation.state` from the recorded one, in m and rad.
+    """
+
+    same_outcome: bool
+    deviation: float
+
+
+def replay(data: DataSet, episode: int) -> ReplayResult:
+    """Start from the episode's seed and execute what was executed.
+
+    Raises:
+        OSError: this machine cannot render.
+    """
+    span, config = data.spans()[episode], data.config
+    column = {name: data.column(name)[span] for name in ("dart.executed_action", "observation.state", "sim.seed")}
+    outcomes = np.stack([data.column("next.reward")[span], data.column("next.success")[span]], axis=1)
+    env = ConstructSkillEnv(config.task, config.obs_type, len(outcomes) + 1, config.light_robot)
+    try:
+        env.reset(seed=int(column["sim.seed"][0]))
+        states, reached = [], []
+        for action in column["dart.executed_action"]:
+            states.append(env.agent_state())
+            reached.append(env.step(action)[1:3])
+    finally:
+        env.close()
+    deviation = np.abs(np.array(states) - column["observation.state"]).max()
+    return ReplayResult(bool((np.array(reached, dtype=float) == outcomes).all()), float(deviation))

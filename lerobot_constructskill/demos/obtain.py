@@ -1,0 +1,36 @@
+"""Demonstrations from a store, where they are made if they are not there."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.demos.recorder import SHARDS, check_disk, write
+from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
+from lerobot_constructskill.envs.gym_env import resolve_rendering
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+
+def artifact(config: GenerateConfig) -> Artifact:
+    """The data set of `config`, whatever it is called and wherever it lies; what renders it is part of it."""
+    facts = generator_facts(config)
+    for name in ("repo_id", "max_failures"):
+        del facts[name]
+    light_robot, backend = resolve_rendering(config.light_robot)
+    drawn = {"light_robot": light_robot, "render_backend": backend}
+    return Artifact("demonstrations", facts | drawn | {"versions": frame_versions()})
+
+
+def obtain_demonstrations(config: GenerateConfig, store: Store) -> "LeRobotDataset":
+    """Return the data set of `config`. Raises as `recorder.record` does."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    made = artifact(config)
+    repo_id = f"local/{made.digest}"
+    with store.claim([made]) as missing:
+        if missing:
+            check_disk(config, store.folder(made))
+            with store.writing(made, keep=SHARDS) as folder:
+                write(replace(config, repo_id=repo_id), folder)
+    return LeRobotDataset(repo_id, root=store.folder(made))

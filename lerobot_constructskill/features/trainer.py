@@ -1,0 +1,112 @@
+"""How a study trains frozen_vit: demonstrations through the encoder once, then all seeds together on what came out."""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.utils.constants import OBS_STATE
+
+from lerobot_constructskill.artifacts.digests import data_sha256, versions
+from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.errors import MissingWeightsError
+from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
+from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.features import describe
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.precision import resolve_precision
+from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
+
+
+class FeatureTrainer:
+    """`study.trainers.Trainer` of frozen_vit."""
+
+    seeds_together = True
+    places = ("backbone_path", "backbone_source")
+    packages = ("torchcodec", "transformers", "timm", "openvino")
+
+    def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
+        """Write out what `auto` means here, and which weights there are; None where there are none."""
+        precision = resolve_precision(config.backbone_precision, config.device)
+        sha256 = find_sha256(get_backbone(config.backbone), config.backbone_path, config.backbone_pretrained)
+        return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
+
+    def fit(
+        self,
+        config: FrozenViTChunkConfig,
+        demonstrations: LeRobotDataset,
+        writers: Mapping[int, Callable[..., AbstractContextManager[Path]]],
+        epochs: int,
+        batch_size: int,
+        held_out: Sequence[int],
+        store: Store,
+    ) -> None:
+        """Train every seed of `writers` and write its checkpoint where its writer says."""
+        features = obtain_features(config, demonstrations, store)
+        policies = train_seeds(config, features, list(writers), epochs, batch_size, held_out)
+        preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
+        errors = heldout_mse(policies, features, held_out, preprocess)
+        for policy, error, write in zip(policies, errors, writers.values(), strict=True):
+            made_of = {config.backbone: _backbone_line(policy.config)}
+            with write(heldout_mse_m2=error, made_of=made_of) as folder:
+                save_checkpoint(policy, features, folder)
+
+    def heldout_mse(
+        self, checkpoints: Sequence[Path], demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store
+    ) -> list[float | None]:
+        """Return each checkpoint's translation error on other demonstrations, in m2; None where they lack an input."""
+        return [self._heldout_mse(checkpoint, demonstrations, held_out, store) for checkpoint in checkpoints]
+
+    def _heldout_mse(
+        self, checkpoint: Path, demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store
+    ) -> float | None:
+        policy = FrozenViTChunkPolicy.from_pretrained(checkpoint)
+        if policy.config.use_state and OBS_STATE not in demonstrations.meta.features:
+            return None
+        features = obtain_features(policy.config, demonstrations, store)
+        preprocess, _ = make_pre_post_processors(policy.config, str(checkpoint))
+        return heldout_mse([policy], features, held_out, preprocess)[0]
+
+
+def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset, store: Store) -> LeRobotDataset:
+    """Return the features of demonstrations under a policy's encoder, from a store, where they are made if need be.
+
+    Patch features, 0.2 MB a frame, are there where the policy's readout looks at them.
+
+    Raises:
+        FileNotFoundError: no source has the encoder's weights.
+    """
+    if config.backbone_sha256 is None:
+        load_weights(get_backbone(config.backbone), config.backbone_path)  # says what was tried
+        raise MissingWeightsError(f"The weights of {config.backbone} came while the study ran: start it again.")
+    spec, patches = get_backbone(config.backbone), READOUTS[config.readout].reads_patches
+    precision = config.backbone_trained_precision or config.backbone_precision
+    made_by = describe(spec, config.backbone_sha256, precision, config.crop, config.blind)
+    source = {"demonstrations_sha256": _cached_sha256(demonstrations.root), "camera": config.camera}
+    made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
+    made = Artifact("features", {**source, "patches": patches, "encoder": made_by, "versions": made_in})
+    repo_id = f"local/{made.digest}"
+    with store.claim([made]) as missing:
+        if missing:
+            eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
+            encoder, info = load_encoder(config.backbone, config.backbone_path, precision, *eyes)
+            with store.writing(made, keep=PARTS) as folder:
+                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, patches=patches)
+    return LeRobotDataset(repo_id, root=store.folder(made))
+
+
+def _backbone_line(config: FrozenViTChunkConfig) -> str:
+    """What the backbone is, whose weights are none of the checkpoint's."""
+    precision, trained = config.backbone_precision, config.backbone_trained_precision
+    crossed = f", trained in {trained}" if trained != precision else ""
+    return f"{config.backbone_source}, SHA-256 {config.backbone_sha256[:12]}, {precision}{crossed}"
+
+
+_cached_sha256 = cache(data_sha256)
+"""A finished data set does not change."""

@@ -1,0 +1,87 @@
+"""Many policies that see alike: one encoder for all of them, one batch for each step, and each frame only once."""
+
+import hashlib
+from collections.abc import Hashable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from .modeling_frozen_vit import FrozenViTChunkPolicy
+
+POOLED = "observation.pooled"
+"""What `FrozenViTChunkPolicy.pool` returns for the image, in place of it in a batch."""
+
+type Batches = Mapping[int, dict]
+"""Preprocessed batches of one frame each, by their policy's number."""
+
+
+class SharedEyes:
+    """Puts what their readouts take of an image in place of the image, for policies of which many may see alike.
+
+    Args:
+        policies: by number. Those whose encoders are the same get one object.
+    """
+
+    def __init__(self, policies: "Mapping[int, FrozenViTChunkPolicy]"):
+        self._groups: dict[Hashable, _Memory] = {}
+        self._members: dict[int, Hashable] = {}
+        for number, policy in policies.items():
+            key = _eyes(policy)
+            memory = self._groups.setdefault(key, _Memory(policy))
+            policy.backbone = memory.policy.backbone
+            self._members[number] = key
+
+    def __call__(self, batches: Batches) -> dict[int, dict]:
+        """Return the batches, each with `POOLED`; a batch without the image stays as it is."""
+        seen = dict(batches)
+        for key, memory in self._groups.items():
+            image_key = memory.policy.config.image_key
+            numbers = [number for number in batches if self._members[number] == key and image_key in batches[number]]
+            pooled = memory.pool([batches[number][image_key] for number in numbers])
+            for number, of_image in zip(numbers, pooled, strict=True):
+                rest = {name: value for name, value in batches[number].items() if name != image_key}
+                seen[number] = rest | {POOLED: of_image}
+        return seen
+
+
+class _Memory:
+    """One encoder, and what it made of the frames that it has seen.
+
+    With a fixed spawn a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
+
+    Args:
+        policy: one of the policies that see with it.
+        capacity: numbers remembered (1.6 GB): a million pooled features, or 4,000 frames' patch features.
+    """
+
+    def __init__(self, policy: "FrozenViTChunkPolicy", capacity: int = 400_000_000):
+        self.policy = policy
+        self.capacity = capacity
+        self._seen: dict[bytes, Tensor] = {}
+
+    @torch.inference_mode()
+    def pool(self, images: Sequence[Tensor]) -> list[Tensor]:
+        """Encode (1, 3, H, W) images to the (1, ...) that the policies' readout takes of them."""
+        keys = [hashlib.sha256(image.cpu().numpy()).digest() for image in images]
+        new = {key: image for key, image in zip(keys, images, strict=True) if key not in self._seen}
+        encoded = self._encode(list(new.values()))
+        if new and (len(self._seen) + len(new)) * encoded[0].numel() > self.capacity:
+            self._seen = {key: self._seen[key] for key in keys if key in self._seen}
+        self._seen |= zip(new, encoded, strict=True)
+        return [self._seen[key] for key in keys]
+
+    def _encode(self, images: list[Tensor]) -> Sequence[Tensor]:
+        if not images:
+            return []
+        if self.policy.backbone.runtime == "torch" and images[0].device.type == "cpu":
+            return [self.policy.pool(image) for image in images]  # batches are no faster here, and round differently
+        return self.policy.pool(torch.cat(images)).split(1)
+
+
+def _eyes(policy: "FrozenViTChunkPolicy") -> Hashable:
+    """Equal for policies that take the same of an image."""
+    config = policy.config
+    encoder = config.backbone, config.backbone_sha256, config.backbone_precision, config.blind
+    return *encoder, config.crop and tuple(config.crop), config.camera, config.readout, config.device

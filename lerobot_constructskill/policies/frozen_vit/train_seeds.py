@@ -1,0 +1,223 @@
+"""Many training seeds in one pass over a feature set, each of which ends as an ordinary LeRobot checkpoint.
+
+The heads of every seed are stacked and stepped together. AdamW works element by element, gradients are clipped per
+seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding. Where a
+readout learns, each step reads 100 MB of patch features per seed, and stacking them would only cost memory: the seeds
+then train one after another.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy, deepcopy
+from pathlib import Path
+
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state, vmap
+
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.progress import Progress
+
+from .configuration_frozen_vit import FrozenViTChunkConfig
+from .features import open_patches
+from .heads import ChunkHeads, chunk_errors
+from .modeling_frozen_vit import FrozenViTChunkPolicy
+
+
+def train_seeds(
+    config: FrozenViTChunkConfig,
+    dataset: LeRobotDataset,
+    seeds: Sequence[int],
+    epochs: int,
+    batch_size: int,
+    held_out: Sequence[int] = (),
+) -> list[FrozenViTChunkPolicy]:
+    """Train one policy per seed on a feature set, and return them in the order of the seeds.
+
+    A seed decides the first weights of its heads, as in `lerobot-train --seed`, and the order of its samples. The
+    policies share one backbone.
+
+    Args:
+        epochs: passes over the episodes that are not held out.
+        batch_size: frames per step and seed.
+        held_out: numbers of the episodes that are.
+
+    Raises:
+        ValueError: the data set has images in place of features, or they are another encoder's.
+    """
+    template = make_policy(deepcopy(config), ds_meta=dataset.meta)
+    if template.config.feature_column is None:
+        raise InputError(
+            f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
+            "constructskill-encode makes of a data set."
+        )
+    preprocess, _ = make_pre_post_processors(template.config, dataset_stats=dataset.meta.stats)
+    table = _read_table(template, dataset, preprocess)
+    inputs = _head_inputs(template, table)
+    rows = torch.nonzero(~_is_among(dataset, held_out)).squeeze(1)
+    heads = [_fresh_heads(template, seed) for seed in seeds]
+    orders = [_Order(rows, seed, epochs, batch_size) for seed in seeds]
+    at_once = 1 if template.readout.learns else len(seeds)
+    for some in (slice(first, first + at_once) for first in range(0, len(seeds), at_once)):
+        _step_together(heads[some], template.config, inputs, table, orders[some])
+    return [_with_heads(template, its_heads) for its_heads in heads]
+
+
+def heldout_mse(
+    policies: Sequence[FrozenViTChunkPolicy],
+    dataset: LeRobotDataset,
+    held_out: Sequence[int],
+    preprocess: Callable[[dict], dict],
+) -> list[float | None]:
+    """Translation error of each policy on some demonstrations of a feature set, in m2; None where they are none.
+
+    Args:
+        policies: they differ in their heads alone.
+        dataset: any feature set with the inputs of the policies' own, by the same encoder.
+        held_out: numbers of the episodes.
+        preprocess: the policies' preprocessor, with the statistics of the set that they were trained on.
+    """
+    is_heldout = _is_among(dataset, held_out)
+    if not is_heldout.any():
+        return [None] * len(policies)
+    table = _read_table(policies[0], dataset, preprocess)
+    heldout = {name: column[is_heldout] for name, column in table.items()}
+    return [_mean_error(_reading_from(policy, dataset), heldout) for policy in policies]
+
+
+def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folder: Path) -> None:
+    """Write what `lerobot-eval --policy.path=<folder>` loads: configuration, weights and the two processors."""
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats):
+        processor.save_pretrained(folder)
+
+
+class _Order:
+    """The order in which one seed sees its samples: every row once per epoch."""
+
+    def __init__(self, rows: Tensor, seed: int, epochs: int, batch_size: int):
+        self.rows, self.epochs, self.batch_size = rows, epochs, batch_size
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def epoch(self) -> Tensor:
+        return self.rows[torch.randperm(len(self.rows), generator=self.generator)]
+
+    @property
+    def n_steps(self) -> int:
+        return self.epochs * -(-len(self.rows) // self.batch_size)
+
+
+def _is_among(dataset: LeRobotDataset, episodes: Sequence[int]) -> Tensor:
+    """Which rows (N,) belong to one of some episodes."""
+    return torch.isin(_episodes(dataset), torch.tensor(list(episodes), dtype=torch.int64))
+
+
+def _episodes(dataset: LeRobotDataset) -> Tensor:
+    return torch.as_tensor(dataset.hf_dataset.with_format("numpy")["episode_index"][:]).flatten()
+
+
+def _read_table(
+    policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, preprocess: Callable[[dict], dict]
+) -> dict[str, Tensor]:
+    """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T)."""
+    columns = dataset.hf_dataset.with_format("numpy")
+    names = policy.config.feature_key, "index", *policy.config.input_features
+    table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
+    rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
+    table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
+    table[f"{ACTION}_is_pad"] = rows > last
+    return {name: value for name, value in preprocess(table).items() if torch.is_tensor(value)}
+
+
+def _chunk_rows(episodes: Tensor, chunk_size: int) -> tuple[Tensor, Tensor]:
+    """Rows (N, T) of the steps from every row on, and the last row (N, 1) of its episode."""
+    rows = torch.arange(len(episodes))
+    last = torch.searchsorted(episodes, episodes, right=True) - 1
+    return rows[:, None] + torch.arange(chunk_size), last[:, None]
+
+
+def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tuple[Tensor, ...]:
+    """What the heads see of every row; patch features that a readout learns from stay on the disk."""
+    state = (table[OBS_STATE],) if policy.config.use_state else ()
+    if policy.readout.learns:
+        return open_patches(policy.patches_root), *state
+    pooled = [policy.head_inputs(rows)[0] for rows in _split(table)]
+    return torch.cat(pooled), *state
+
+
+def _reading_from(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> FrozenViTChunkPolicy:
+    """The same policy, which looks for patch features in another data set's folder."""
+    reader = copy(policy)
+    reader.patches_root = dataset.root
+    return reader
+
+
+def _mean_error(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> float:
+    totals, counts = zip(*(policy.translation_error(rows) for rows in _split(table)), strict=True)
+    return sum(totals) / sum(counts)
+
+
+def _split(table: dict[str, Tensor], size: int = 256) -> Iterator[dict[str, Tensor]]:
+    """Yield a table in pieces: patch features take 0.4 MB a row."""
+    for first in range(0, len(table[ACTION]), size):
+        yield {name: column[first : first + size] for name, column in table.items()}
+
+
+def _fresh_heads(policy: FrozenViTChunkPolicy, seed: int) -> ChunkHeads:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return policy.fresh_heads().to(policy.config.device)
+
+
+def _step_together(
+    heads: Sequence[ChunkHeads],
+    config: FrozenViTChunkConfig,
+    inputs: tuple[Tensor, ...],
+    table: dict[str, Tensor],
+    orders: Sequence[_Order],
+) -> None:
+    """Train `heads` in place."""
+    preset, weight = config.get_optimizer_preset(), config.regression_weight
+    stacked, _ = stack_module_state(list(heads))
+    parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
+    optimizer = preset.build(list(parameters.values()))
+    n_steps = orders[0].n_steps
+    schedule = config.get_scheduler_preset()
+    scheduler = schedule.build(optimizer, n_steps) if schedule else None
+    for batch in Progress(_batches(orders), f"training {len(heads)} seeds", n_steps, unit="step"):
+        target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
+        seen = [column[batch].to(config.device).float() for column in inputs]
+        raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
+        losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss(weight))(raw, target, padded)
+        optimizer.zero_grad()
+        losses.sum().backward()
+        _clip_each(parameters.values(), preset.grad_clip_norm)
+        optimizer.step()
+        if scheduler:
+            scheduler.step()
+    for number, own in enumerate(heads):
+        own.load_state_dict({name: tensor[number] for name, tensor in parameters.items()})
+
+
+def _batches(orders: Sequence[_Order]) -> Iterator[Tensor]:
+    """Yield rows (S, B), one line per seed."""
+    for _ in range(orders[0].epochs):
+        yield from torch.stack([order.epoch() for order in orders]).split(orders[0].batch_size, dim=1)
+
+
+def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
+    """`torch.nn.utils.clip_grad_norm_` for every seed by itself."""
+    gradients = [parameter.grad for parameter in parameters]
+    norms = torch.stack([gradient.flatten(1).norm(dim=1) for gradient in gradients]).norm(dim=0)
+    scale = (longest / (norms + 1e-6)).clamp(max=1.0)
+    for gradient in gradients:
+        gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
+
+
+def _with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
+    """A copy of a policy with other heads and the same backbone."""
+    policy = deepcopy(template, {id(template.backbone): template.backbone})
+    policy.heads = heads
+    return policy

@@ -1,0 +1,142 @@
+"""What a rollout can drive an environment with: any LeRobot policy, and anything else that acts."""
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.utils import preprocess_observation
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.pretrained import PreTrainedPolicy
+
+from lerobot_constructskill.parsing import as_input
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What an environment shows of one step.
+
+    Args:
+        seen: the environment's observation.
+        sim: privileged state, `contract.SIM_STATE` name to float32 array; for experts alone.
+        instruction: the task's sentence.
+    """
+
+    seen: dict[str, Any]
+    sim: dict[str, np.ndarray]
+    instruction: str
+
+
+class Agent(Protocol):
+    """Something that acts in one environment."""
+
+    def reset(self, seed: int) -> None:
+        """Forget the last episode; `seed` is that of the next one."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """Return the action of this step, float32 (A,), in metres with the gripper last."""
+
+
+class PolicyAgent:
+    """A LeRobot policy between its two processors, as `lerobot-eval` runs it.
+
+    Args:
+        policy: the policy, in evaluation mode.
+        preprocessor: from observations to what the policy reads.
+        postprocessor: from the policy's output to actions.
+    """
+
+    def __init__(self, policy: PreTrainedPolicy, preprocessor, postprocessor):
+        self.policy, self.preprocessor, self.postprocessor = policy.eval(), preprocessor, postprocessor
+
+    @classmethod
+    def from_pretrained(cls, checkpoint: Path | str, device: str | None = None, **overrides: Any) -> "PolicyAgent":
+        """Load a checkpoint folder, or a name on the Hub, of any registered policy type.
+
+        Args:
+            overrides: fields of its configuration, in place of its own where they are not None.
+
+        Raises:
+            ValueError: its configuration cannot be read, or is of an unknown type.
+            OSError: there is no such checkpoint.
+        """
+        with as_input():
+            flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
+            config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
+        config.device = device or config.device
+        config.pretrained_path = checkpoint
+        with redirect_stdout(StringIO()):  # LeRobot prints where it loads weights from, for every policy
+            policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+        on_device = {"device_processor": {"device": config.device}}
+        processors = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=on_device)
+        return cls(policy, *processors)
+
+    def reset(self, seed: int) -> None:
+        self.policy.reset()
+
+    def act(self, observation: Observation) -> np.ndarray:
+        return self.decide(self.see(observation))
+
+    @torch.inference_mode()
+    def see(self, observation: Observation) -> dict[str, Any]:
+        """Preprocess an observation to the policy's batch of one."""
+        return self.preprocessor(preprocess_observation(observation.seen) | {"task": [observation.instruction]})
+
+    @torch.inference_mode()
+    def decide(self, batch: dict[str, Any]) -> np.ndarray:
+        """Return the action for a batch of one."""
+        return self.postprocessor(self.policy.select_action(batch)).squeeze(0).cpu().numpy()
+
+
+class Lockstep:
+    """Many agents of which each acts once a step; what several policies of a class compute alike is computed once.
+
+    A policy class takes part by an attribute `in_lockstep`: called with its policies by number it returns a function,
+    which is called with their preprocessed batches by number and returns batches that `select_action` takes as well.
+    """
+
+    def __init__(self, agents: Sequence[Agent]):
+        self._agents = agents
+        by_class: dict[type, dict[int, PreTrainedPolicy]] = {}
+        for number, agent in enumerate(agents):
+            if isinstance(agent, PolicyAgent):
+                by_class.setdefault(type(agent.policy), {})[number] = agent.policy
+        self._shared = {
+            tuple(policies): kind.in_lockstep(policies)
+            for kind, policies in by_class.items()
+            if hasattr(kind, "in_lockstep")
+        }
+
+    def act(self, observations: Mapping[int, Observation]) -> dict[int, np.ndarray | Exception]:
+        """The action of every agent, by number, or the exception that it raised."""
+        answers: dict[int, Any] = {}
+        batches: dict[int, dict] = {}
+        for number, observation in observations.items():
+            agent = self._agents[number]
+            if not isinstance(agent, PolicyAgent):
+                answers[number] = caught(agent.act, observation)
+            elif isinstance(batch := caught(agent.see, observation), Exception):
+                answers[number] = batch
+            else:
+                batches[number] = batch
+        for numbers, share in self._shared.items():
+            own = {number: batches[number] for number in numbers if number in batches}
+            seen = caught(share, own)
+            batches |= dict.fromkeys(own, seen) if isinstance(seen, Exception) else seen
+        for number, batch in batches.items():
+            failed = isinstance(batch, Exception)
+            answers[number] = batch if failed else caught(self._agents[number].decide, batch)
+        return answers
+
+
+def caught(call: Callable[..., Any], *args: Any) -> Any:
+    """What a call returns, or the exception that it raises."""
+    try:
+        return call(*args)
+    except Exception as error:
+        return error

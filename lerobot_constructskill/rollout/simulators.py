@@ -1,0 +1,139 @@
+"""Many environments in a few processes, each stepped on its own."""
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from lerobot_constructskill.artifacts.pools import cores
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import MachineError, full_traceback
+
+PRELOADED = ["lerobot_constructskill.sim.register", "lerobot_constructskill.rollout.simulators"]
+"""Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What an environment returned from `reset` or `step`, with its privileged state."""
+
+    seen: dict[str, Any]
+    sim: dict[str, np.ndarray]
+    done: bool
+    info: dict[str, Any]
+
+
+class Simulators:
+    """Equal environments, spread over worker processes; environment i lives in worker i % workers.
+
+    Every method takes a mapping from an environment's number and answers with one, in which an environment that raised
+    has its exception. They raise `OSError` where a worker died, for want of memory for instance.
+    """
+
+    def __init__(self, workers: Sequence[Connection]):
+        self._workers = workers
+
+    def reset(self, seeds: Mapping[int, int]) -> dict[int, Step | Exception]:
+        """Start an episode in each named environment: number to seed."""
+        return self._ask("reset", seeds)
+
+    def step(self, actions: Mapping[int, np.ndarray]) -> dict[int, Step | Exception]:
+        """Advance each named environment: number to action."""
+        return self._ask("step", actions)
+
+    def backend(self, number: int) -> str:
+        """What simulates and renders an environment that has been reset."""
+        return self._ask("backend", {number: None})[number]
+
+    def _ask(self, verb: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
+        shares = [{} for _ in self._workers]
+        for number, argument in arguments.items():
+            shares[number % len(shares)][number] = argument
+        asked = [(worker, share) for worker, share in zip(self._workers, shares, strict=True) if share]
+        for worker, share in asked:
+            worker.send((verb, share))
+        answers: dict[int, Any] = {}
+        for worker, _ in asked:
+            answers |= _receive(worker)
+        return answers
+
+
+@contextmanager
+def simulators(count: int, env_kwargs: Mapping[str, Any], n_workers: int | None = None) -> Iterator[Simulators]:
+    """Open `count` environments of `ConstructSkillEnv(**env_kwargs)` in `n_workers` processes (one per core)."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    n_workers = min(count, n_workers or cores())
+    processes, connections = [], []
+    try:
+        for _ in range(n_workers):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_work, args=(theirs, dict(env_kwargs)), daemon=True)
+            process.start()
+            theirs.close()
+            processes.append(process)
+            connections.append(ours)
+        yield Simulators(connections)
+    finally:
+        for connection in connections:
+            connection.close()
+        for process in processes:
+            process.join(timeout=10)
+            process.kill()
+
+
+def _receive(worker: Connection) -> dict[int, Any]:
+    try:
+        return worker.recv()
+    except (EOFError, ConnectionError):
+        raise MachineError("A simulator's process died; run fewer at once if memory was short.") from None
+
+
+def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:
+    """Serve environments until the other side hangs up."""
+    _use_one_thread()
+    envs: dict[int, ConstructSkillEnv] = {}
+    while True:
+        try:
+            verb, arguments = connection.recv()
+        except (EOFError, KeyboardInterrupt):
+            break
+        for number in arguments.keys() - envs.keys():
+            envs[number] = ConstructSkillEnv(**env_kwargs)
+        connection.send({number: _attempt(verb, envs[number], argument) for number, argument in arguments.items()})
+    for env in envs.values():
+        env.close()
+
+
+def _use_one_thread() -> None:
+    """Workers share the cores; threads of theirs would stall each other."""
+    import torch
+
+    os.environ["LP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
+
+
+def _reset(env: ConstructSkillEnv, seed: int) -> Step:
+    seen, info = env.reset(seed=seed)
+    return Step(seen, env.privileged_state(), False, info)
+
+
+def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
+    seen, _, terminated, truncated, info = env.step(action)
+    return Step(seen, env.privileged_state(), terminated or truncated, info)
+
+
+_VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}
+
+
+def _attempt(verb: str, env: ConstructSkillEnv, argument: Any) -> Any:
+    try:
+        return _VERBS[verb](env, argument)
+    except Exception as error:
+        error.add_note(full_traceback(error))  # an exception leaves its traceback behind when it leaves the process
+        return error

@@ -1,0 +1,41 @@
+"""`constructskill-config`: the configurations that are shipped, and the path of one, for `lerobot-train`."""
+
+import argparse
+
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.presets import KINDS, description, find, names
+from lerobot_constructskill.scripts.console import EPILOG, edge
+
+
+def show(name: str | None = None) -> str:
+    """The path of a configuration such as `train/act`; without a name, a line for each of them.
+
+    Raises:
+        MissingError: there is no such configuration.
+    """
+    shipped = {f"{kind}/{one}": find(kind, one) for kind in KINDS for one in names(kind)}
+    if name is None:
+        width = max(map(len, shipped))
+        return "\n".join(f"{one:<{width}}  {description(path)}" for one, path in shipped.items())
+    if name not in shipped:
+        raise MissingError(f"There is no configuration '{name}'; there are: {', '.join(shipped)}.")
+    return str(shipped[name])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="constructskill-config",
+        description="Print the path of a shipped configuration, or list them all. "
+        "As in: lerobot-train --config_path=$(constructskill-config train/act)",
+        epilog=EPILOG,
+    )
+    parser.add_argument("name", nargs="?", help="generate/NAME, study/NAME or train/NAME; all are listed without it")
+    with edge():
+        arguments, unknown = parser.parse_known_args()
+        if unknown:
+            raise InputError(f"unrecognized arguments: {' '.join(unknown)}")
+        print(show(arguments.name))
+
+
+if __name__ == "__main__":
+    main()

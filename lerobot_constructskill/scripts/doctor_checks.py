@@ -1,0 +1,188 @@
+"""What `constructskill-doctor` makes of a machine: each judgement is a pure function of facts."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+DISTRIBUTION = "lerobot_env_constructskill"
+PYTHONS = ((3, 12), (3, 13))
+"""Those that `make setup` takes, for which every pinned package has a wheel."""
+MESA_MINIMUM = (24, 3)
+"""The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
+
+DEMO_FRAMES = 8_623
+"""What `constructskill-generate fast_shifted_wrist` makes, and `make demo` encodes."""
+
+OPENCV = (
+    "opencv-python",
+    "opencv-python-headless",
+    "opencv-contrib-python",
+    "opencv-contrib-python-headless",
+)
+
+
+class Level(StrEnum):
+    OK = "OK"
+    WARN = "WARN"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report; the message of a WARN or FAIL ends in what to do."""
+
+    level: Level
+    name: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Probe:
+    """How a snippet fared in a process of its own: drivers print, and take the whole process with them."""
+
+    ok: bool
+    out: str
+    reason: str
+
+
+def judge_python(version: tuple[int, int]) -> Finding:
+    text = ".".join(map(str, version))
+    if version < PYTHONS[0]:
+        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12; run `make setup`.")
+    if version not in PYTHONS:
+        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 and 3.13 this was tested with.")
+    return Finding(Level.OK, "Python", text)
+
+
+def judge_name(names: Sequence[str]) -> Finding:
+    """LeRobot compares the raw `Name:`, so a build backend that writes hyphens hides the plugin."""
+    if DISTRIBUTION in names:
+        return Finding(Level.OK, "Distribution", DISTRIBUTION)
+    if DISTRIBUTION.replace("_", "-") in names:
+        return Finding(
+            Level.FAIL,
+            "Distribution",
+            "its name has hyphens, which LeRobot does not find; reinstall with pip or uv: `make setup`.",
+        )
+    return Finding(Level.FAIL, "Distribution", f"{DISTRIBUTION} is not installed; run `make setup`.")
+
+
+def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) -> Finding:
+    """Compare installed versions with our own metadata; only packages of an extra may be absent."""
+    from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
+
+    wrong, absent, right = [], set(), []
+    for requirement in map(Requirement, requirements):
+        marker = requirement.marker
+        extras = [e for e in ("", "sim", "offline") if marker is None or marker.evaluate({"extra": e})]
+        found = installed.get(canonicalize_name(requirement.name))
+        if not extras:
+            continue
+        if found is None and extras[0]:
+            absent.add(extras[0])
+        elif found is None or not requirement.specifier.contains(found, prereleases=True):
+            wrong.append(f"{requirement.name} is {found or 'absent'} (needs {requirement.specifier})")
+        else:
+            right.append(f"{requirement.name} {found}")
+    if wrong:
+        return Finding(Level.FAIL, "Versions", f"{', '.join(wrong)}; run `make setup`.")
+    if absent:
+        extra = ",".join(sorted(absent))
+        return Finding(Level.WARN, "Versions", f"without the extra [{extra}]; pip install '{DISTRIBUTION}[{extra}]'.")
+    return Finding(Level.OK, "Versions", ", ".join(right))
+
+
+def judge_opencv(names: Sequence[str]) -> Finding:
+    found = sorted(set(OPENCV) & set(names))
+    if len(found) > 1:
+        remedy = f"uninstall {' and '.join(found)}, then install opencv-python-headless alone."
+        return Finding(Level.WARN, "OpenCV", f"{' and '.join(found)} write into one cv2 folder; {remedy}")
+    if not found:
+        return Finding(Level.FAIL, "OpenCV", "none is installed; pip install opencv-python-headless.")
+    return Finding(Level.OK, "OpenCV", found[0])
+
+
+def judge_mesa(version: str | None, gpu: bool) -> Finding:
+    """Judge Debian's version of mesa-vulkan-drivers; None where it is not installed or not known."""
+    if gpu:
+        return Finding(Level.OK, "Mesa", "not needed where the NVIDIA GPU renders: see Vulkan")
+    wanted = ".".join(map(str, MESA_MINIMUM))
+    numbers = re.match(r"(?:\d+:)?(\d+)\.(\d+)", version or "")
+    if numbers is None:
+        return Finding(
+            Level.WARN,
+            "Mesa",
+            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, run `make setup` (>= {wanted}).",
+        )
+    if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
+        return Finding(
+            Level.FAIL,
+            "Mesa",
+            f"{version}, but lavapipe renders for SAPIEN from {wanted} on; run `make setup`.",
+        )
+    return Finding(Level.OK, "Mesa", str(version))
+
+
+def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
+    if not simulator:
+        return Finding(Level.WARN, "Vulkan", f"not tried without sapien; pip install '{DISTRIBUTION}[sim]'.")
+    if not probe.ok:
+        return Finding(
+            Level.FAIL,
+            "Vulkan",
+            f"SAPIEN finds no device to render with ({probe.reason}); run `make setup`, or on an NVIDIA "
+            "machine install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all).",
+        )
+    return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{probe.out}'")
+
+
+def judge_plugin(probe: Probe) -> Finding:
+    if probe.ok and probe.out == "True True":
+        return Finding(Level.OK, "Plugin", "LeRobot finds --policy.type=frozen_vit and --env.type=constructskill")
+    reason = probe.reason or "its import does not register them"
+    return Finding(
+        Level.FAIL,
+        "Plugin",
+        f"LeRobot does not find frozen_vit and constructskill ({reason}); run `make setup`.",
+    )
+
+
+def judge_ffmpeg(probe: Probe) -> Finding:
+    if probe.ok:
+        return Finding(Level.OK, "FFmpeg", "torchcodec loads its shared libraries")
+    package = re.search(r"libpython\d\.\d+", probe.reason)
+    missing = package[0] if package else "ffmpeg"
+    return Finding(
+        Level.WARN, "FFmpeg", f"torchcodec finds no {missing}, LeRobot decodes with PyAV; apt-get install {missing}."
+    )
+
+
+def judge_weights(probe: Probe) -> Finding:
+    """Judge lines of "backbone<tab>source", the source empty where there is none."""
+    if not probe.ok:
+        return Finding(Level.FAIL, "Weights", f"could not be looked for ({probe.reason}); run `make setup`.")
+    sources = dict(line.partition("\t")[::2] for line in probe.out.splitlines())
+    found = ", ".join(f"{name} ({source})" for name, source in sources.items() if source)
+    missing = ", ".join(name for name, source in sources.items() if not source)
+    if not missing:
+        return Finding(Level.OK, "Weights", found)
+    remedy = "let this machine reach the Hub, or give a local copy with --policy.backbone_path."
+    if not found:
+        return Finding(Level.FAIL, "Weights", f"none for {missing}; {remedy}")
+    return Finding(Level.WARN, "Weights", f"{found}, but none for {missing}; {remedy}")
+
+
+def judge_encoder(probe: Probe) -> Finding:
+    """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
+    if not probe.ok:
+        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); run `make setup`.")
+    precision, runtime, device, speed = probe.out.split()
+    expected = (
+        f"backbone_precision=auto is {precision} here, {float(speed):.0f} images/s of dinov2_vits14 by {runtime} on "
+        f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for the frames of `make demo`"
+    )
+    if (runtime, device) == ("torch", "cpu"):
+        return Finding(Level.WARN, "Encoder", f"{expected}; pip install '{DISTRIBUTION}[cpu]' to be faster.")
+    return Finding(Level.OK, "Encoder", expected)

@@ -1,0 +1,217 @@
+"""One piece of a study: some seeds of one arm, trained together, evaluated in lockstep, each kept as a run's folder.
+
+<store>/runs/<digest>/  spec.json  checkpoint (a link)  episodes.parquet  video.mp4 (of seed 0)  log.txt (if it failed)
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_constructskill.artifacts.digests import data_sha256, digest, file_sha256
+from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.contract import get_task, held_out
+from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.errors import MachineError, TakenError, kind_of
+from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
+from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
+from lerobot_constructskill.rollout.references import REFERENCES
+from lerobot_constructskill.rollout.video import FirstEpisode
+from lerobot_constructskill.study.rows import EpisodeRow, write_rows
+from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
+from lerobot_constructskill.study.timing import timed
+from lerobot_constructskill.study.trainers import trainer_of
+
+EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
+
+FACTS = "training.json"
+"""In a checkpoint's folder: what its trainer says of it."""
+
+FILMED_SEED = 0
+
+
+@dataclass(frozen=True)
+class Job:
+    """Runs of one arm that are made in one pass.
+
+    Args:
+        runs: they differ in their seeds alone.
+        store: where everything is made.
+        times: folder in which is noted what took how long.
+        workers: processes that generate demonstrations.
+    """
+
+    runs: tuple[Run, ...]
+    store: Store
+    times: Path
+    workers: int = 1
+
+    @property
+    def arm(self) -> Arm:
+        return self.runs[0].arm
+
+
+def make_runs(job: Job) -> Iterator[Run]:
+    """Make the runs of a job that nobody has made yet, and yield each as soon as its folder is there.
+
+    A run that fails has a folder as well: one row that says why, and a log with the traceback.
+    """
+    # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
+    torch.set_flush_denormal(True)
+    with job.store.claim([run.artifact for run in job.runs]) as claimed:
+        missing = {artifact.digest for artifact in claimed}
+        yield from (run for run in job.runs if run.artifact.digest not in missing)
+        runs = [run for run in job.runs if run.artifact.digest in missing]
+        failed = _train(job, runs)
+        for run in runs:
+            if run.seed in failed:
+                yield _write_failed(job, run, failed[run.seed])
+        yield from _evaluate(job, [run for run in runs if run.seed not in failed])
+
+
+def obtain(job: Job, demonstrations: Demonstrations) -> LeRobotDataset:
+    """The data set of some demonstrations, made if it is not there."""
+    with timed(job.times, "demonstrations"):
+        return obtain_demonstrations(replace(demonstrations.config, workers=job.workers), job.store)
+
+
+def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
+    """Train those of `runs` that have no checkpoint yet, and return why some seeds could not be trained."""
+    arm = job.arm
+    if arm.policy is None or not runs:
+        return {}
+    trainer, failed = trainer_of(arm.policy), {}
+    with job.store.claim([run.checkpoint for run in runs]) as claimed:
+        missing = {artifact.digest for artifact in claimed}
+        missing = [run for run in runs if run.checkpoint.digest in missing]
+        for some in [missing] if trainer.seeds_together and missing else [[run] for run in missing]:
+            try:
+                _fit(job, some)
+            except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
+                _let_through(error)
+                failed |= {run.seed: error for run in some if not job.store.has(run.checkpoint)}
+    return failed
+
+
+def _let_through(error: Exception) -> None:
+    """Raise what is no run's fault and may be gone the next time, so that it never stands for the run's result."""
+    if isinstance(error, TakenError | MachineError | MemoryError):
+        raise error
+    if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM):
+        raise error
+
+
+def _fit(job: Job, runs: Sequence[Run]) -> None:
+    arm, training = job.arm, job.arm.training
+    dataset = obtain(job, arm.demonstrations)
+    writers = {run.seed: partial(_writing_checkpoint, job.store, run.checkpoint) for run in runs}
+    kept_out = held_out(dataset.num_episodes, training.holdout)
+    config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
+    with timed(job.times, "encoding and training"):
+        trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
+
+
+@contextmanager
+def _writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
+    with store.writing(checkpoint) as folder:
+        yield folder
+        (folder / FACTS).write_text(json.dumps(facts) + "\n")
+
+
+def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
+    ready = []
+    for run, agent in [(run, caught(_agent, job, run)) for run in runs]:
+        if isinstance(agent, Exception):
+            _let_through(agent)
+            yield _write_failed(job, run, agent)
+        else:
+            ready.append((run, agent))
+    if not ready:
+        return
+    runs, agents = zip(*ready, strict=True)
+    first, count = job.arm.evaluation["seed"], job.arm.evaluation["episodes"]
+    film = FirstEpisode(next((number for number, run in enumerate(runs) if run.seed == FILMED_SEED), None))
+    with timed(job.times, "evaluation"):
+        for number, rollout in roll_out(agents, job.arm.env, range(first, first + count), on_step=film.add):
+            if rollout.error is not None:
+                _let_through(rollout.error)
+                yield _write_failed(job, runs[number], rollout.error)
+            else:
+                yield _write_finished(job, runs[number], rollout, partial(film.write, number))
+
+
+def _agent(job: Job, run: Run) -> Agent:
+    arm = job.arm
+    if arm.policy is not None:
+        config = arm.policy
+        here = {name: getattr(config, name) for name in trainer_of(config).places}  # a path may differ by now
+        return PolicyAgent.from_pretrained(job.store.folder(run.checkpoint), config.device, **here)
+    dataset = obtain(job, arm.demonstrations) if arm.demonstrations else None
+    return REFERENCES[arm.name].agent(get_task(arm.env["task"]), run.seed, dataset)
+
+
+def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
+    row = _row(job, run, rollout.backend)
+    rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
+    return _write(job, run, rows, write_video)
+
+
+def _write_failed(job: Job, run: Run, error: Exception) -> Run:
+    job.store.note(run.artifact, error)
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    return _write(job, run, [replace(_row(job, run), error_kind=kind_of(error), error=said)])
+
+
+def _write(job: Job, run: Run, rows: list[EpisodeRow], write_video=lambda path: None) -> Run:
+    with job.store.writing(run.artifact) as folder:
+        folder.mkdir()
+        write_rows(rows, folder / EPISODES, EpisodeRow)
+        write_video(folder / VIDEO)
+        if run.checkpoint and job.store.has(run.checkpoint):
+            checkpoint = job.store.folder(run.checkpoint)
+            (folder / CHECKPOINT).symlink_to(Path("..", "..", checkpoint.parent.name, checkpoint.name))
+    return run
+
+
+def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
+    """What every row of a run says."""
+    arm, weights, made_of = job.arm, None, {}
+    if run.checkpoint and job.store.has(run.checkpoint):
+        checkpoint = job.store.folder(run.checkpoint)
+        model = checkpoint / "model.safetensors"
+        weights = file_sha256(model) if model.exists() else None
+        made_of = read_facts(checkpoint).get("made_of", {})
+    return EpisodeRow(
+        run=run.artifact.digest,
+        training_seed=run.seed,
+        evaluation_seed=arm.evaluation["seed"],
+        episode=0,
+        dataset_sha256=_dataset_sha256(job),
+        weights_sha256=weights,
+        environment_sha256=digest({"environment": arm.env, "backend": backend}),
+        backend=backend,
+        versions=json.dumps(run.versions | made_of),
+    )
+
+
+def read_facts(checkpoint: Path) -> dict:
+    """What a checkpoint says of its training."""
+    file = checkpoint / FACTS
+    return json.loads(file.read_text()) if file.exists() else {}
+
+
+def _dataset_sha256(job: Job) -> str | None:
+    made = job.arm.demonstrations and job.arm.demonstrations.artifact
+    return _cached_sha256(job.store.folder(made)) if made and job.store.has(made) else None
+
+
+_cached_sha256 = cache(data_sha256)
+"""A finished data set does not change."""

@@ -1,0 +1,203 @@
+"""From a study to its runs: all that a run depends on is read, checked and written out before anything runs."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.device_utils import auto_select_torch_device
+
+from lerobot_constructskill.artifacts.digests import distributions_of, versions
+from lerobot_constructskill.artifacts.store import Artifact
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.demos.obtain import artifact
+from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.envs.gym_env import resolve_rendering
+from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.parsing import decode, parse
+from lerobot_constructskill.presets import find
+from lerobot_constructskill.rollout.references import REFERENCES, Reference
+from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
+from lerobot_constructskill.study.spec import Study, Training, Variant
+from lerobot_constructskill.study.trainers import packages_of, policy_spec, trainer_of
+
+LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
+"""Packages whose versions may show in any checkpoint."""
+
+ACTING = (*LEARNING, "mani_skill", "sapien")
+"""And in what any agent does."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """A data set that a study names: what it is called, and what it is generated from."""
+
+    name: str
+    config: GenerateConfig
+
+    @property
+    def artifact(self) -> Artifact:
+        return artifact(self.config)
+
+
+@dataclass(frozen=True, eq=False)
+class Arm:
+    """A variant or a reference in one setting: its runs differ in their seed alone.
+
+    Args:
+        setting, name, role: as in `rows.Row`.
+        env: keyword arguments of `ConstructSkillEnv`.
+        evaluation: `seed` of the first episode, and how many `episodes`.
+        demonstrations: what it learns from or replays, if it does.
+        validated_on: all demonstrations of its setting.
+        policy: settled configuration of what is trained; None for references that are not.
+        training: how.
+    """
+
+    setting: str
+    name: str
+    role: str
+    env: dict[str, Any]
+    evaluation: dict[str, int]
+    demonstrations: Demonstrations | None
+    validated_on: tuple[Demonstrations, ...] = ()
+    policy: PreTrainedConfig | None = None
+    training: Training | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One training seed of an arm: the unit of evidence. Its names are no part of its specification."""
+
+    arm: Arm
+    seed: int
+
+    @property
+    def id(self) -> str:
+        return f"{self.arm.setting}/{self.arm.name}/seed_{self.seed}"
+
+    @cached_property
+    def checkpoint(self) -> Artifact | None:
+        """What it trains."""
+        arm = self.arm
+        if arm.policy is None:
+            return None
+        facts = {"policy": policy_spec(arm.policy), "training": asdict(arm.training), "seed": self.seed}
+        made_by = versions(*LEARNING, *packages_of(arm.policy))
+        made_on = {"demonstrations": arm.demonstrations.artifact.spec, "versions": made_by}
+        return Artifact("checkpoints", facts | made_on)
+
+    @cached_property
+    def artifact(self) -> Artifact:
+        """Its episodes."""
+        arm = self.arm
+        agent = {"checkpoint": self.checkpoint.spec} if self.checkpoint else {"reference": arm.name, "seed": self.seed}
+        if self.checkpoint is None and arm.demonstrations:
+            agent["demonstrations"] = arm.demonstrations.artifact.spec
+        facts = {"environment": arm.env, "evaluation": arm.evaluation, "versions": self.versions}
+        return Artifact("runs", agent | facts)
+
+    @cached_property
+    def versions(self) -> dict[str, str]:
+        """Of the packages that may show in its episodes."""
+        policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
+        own = packages_of(policy) if policy else distributions_of(reference.agent)
+        return versions(*ACTING, *own)
+
+    def heldout(self, demonstrations: Demonstrations) -> Artifact:
+        """Its translation error on what is held out of some demonstrations."""
+        on = {"demonstrations": demonstrations.artifact.spec, "holdout": self.arm.training.holdout}
+        return Artifact("heldout", {"checkpoint": self.checkpoint.spec, **on})
+
+
+def list_runs(study: Study) -> list[Run]:
+    """Every run of a study: the references of each setting, then its variants, in the study's order.
+
+    Raises:
+        InputError: a field, anywhere in the study, that nothing can be run with; the message names it.
+    """
+    runs = []
+    for name, setting in study.settings.items():
+        with _inside(f"settings.{name}.env"):
+            env = _resolve_env(setting.env)
+        sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
+        evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
+        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
+        own = sets[setting.data]
+        for reference, seeds in study.references.items():
+            arm = _reference_arm(study, reference, own, common)
+            runs += [Run(arm, seed) for seed in range(seeds)]
+        for variant_name, variant in study.variants_in(name).items():
+            arm = _variant_arm(study, variant_name, variant, sets[variant.data or setting.data], common)
+            runs += [Run(arm, seed) for seed in range(variant.seeds)]
+    return runs
+
+
+def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
+    with _inside(f"variants.{name}.policy"):
+        policy = _settle(variant.policy)
+    training = _training_of(study, name, variant)
+    return Arm(name=name, role=VARIANT, demonstrations=data, policy=policy, training=training, **common)
+
+
+def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
+    if name not in REFERENCES:
+        raise InputError(f"Unknown reference '{name}'; there are: {', '.join(REFERENCES)}.")
+    reference = REFERENCES[name]
+    arm = Arm(name=name, role=REFERENCE if reference.looks else SIGHTLESS, demonstrations=None, **common)
+    if reference.policy:
+        base, variant = _variant_with(study, name, reference)
+        with _inside(f"references.{name}"):
+            policy = _settle({**variant.policy, **reference.policy})
+        return replace(arm, demonstrations=data, policy=policy, training=_training_of(study, base, variant))
+    return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
+
+
+def _variant_with(study: Study, name: str, reference: Reference) -> tuple[str, Variant]:
+    """The first variant whose policy has the fields that a reference sets otherwise."""
+    for of_variant, variant in study.variants.items():
+        with _inside(f"variants.{of_variant}.policy"):
+            kind = type(_decode_policy(variant.policy))
+        if all(hasattr(kind, field) for field in reference.policy):
+            return of_variant, variant
+    fields = ", ".join(reference.policy)
+    raise InputError(f"The reference '{name}' needs a variant whose policy has {fields}, as frozen_vit has.")
+
+
+def _training_of(study: Study, name: str, variant: Variant) -> Training:
+    with _inside(f"variants.{name}.training"):
+        return decode(Training, {**asdict(study.training), **variant.training})
+
+
+def _settle(fields: Mapping[str, Any]) -> PreTrainedConfig:
+    config = _decode_policy(fields)
+    return trainer_of(config).settle(config)
+
+
+def _decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
+    return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
+
+
+def _resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
+    env = decode(EnvConfig, {**fields, "type": "constructskill"}).gym_kwargs
+    length = env["episode_length"] or get_task(env["task"]).horizon
+    light_robot, backend = resolve_rendering(env["light_robot"], env["render_backend"])
+    return env | {"episode_length": length, "light_robot": light_robot, "render_backend": backend}
+
+
+def _read_demonstrations(setting: str, data: str) -> Demonstrations:
+    with _inside(f"settings.{setting}, data {data}"):
+        return Demonstrations(data, parse(GenerateConfig, ["--repo_id=local/any"], find("generate", data)))
+
+
+@contextmanager
+def _inside(where: str) -> Iterator[None]:
+    """Say in which part of the study a field lies that cannot be used."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(f"{where}: {error}") from error

@@ -1,0 +1,165 @@
+"""A study as a file: what is trained on what, with which seeds, and where it is evaluated."""
+
+import math
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot_constructskill.artifacts.pools import EXECUTORS
+from lerobot_constructskill.contract import HELD_OUT_EVERY
+from lerobot_constructskill.errors import InputError
+
+NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
+"""What settings and variants are called: they name videos and stand in every row."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A data set and the environment that its policies are evaluated in.
+
+    Args:
+        data: the demonstrations: a name or file that `constructskill-generate` takes.
+        env: fields of `--env.type=constructskill`.
+    """
+
+    data: str
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A policy to train, once per seed and setting.
+
+    Args:
+        policy: fields of a LeRobot policy, `type` among them.
+        seeds: training seeds 0 to `seeds` - 1.
+        data: other demonstrations than the setting's, for an ablation of the data.
+        settings: names of the settings it runs in; all of them by default.
+        training: fields of `Training` that differ from the study's.
+    """
+
+    policy: dict[str, Any]
+    seeds: int = 10
+    data: str | None = None
+    settings: list[str] | None = None
+    training: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Training:
+    """How every variant is trained (spec, section 4). Learning rate and weight decay are the policy's.
+
+    Args:
+        epochs: passes over the demonstrations that are not held out.
+        batch_size: frames per step.
+        holdout: one demonstration of so many is held out.
+
+    Raises:
+        ValueError: a number that nothing can be trained with.
+    """
+
+    epochs: int = 150
+    batch_size: int = 256
+    holdout: int = HELD_OUT_EVERY
+
+    def __post_init__(self):
+        for name, least in (("epochs", 1), ("batch_size", 1), ("holdout", 2)):
+            _check_count(f"training.{name}", getattr(self, name), least)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs that are to be compared: every variant in every setting with every seed, and references beside them.
+
+    Args:
+        name: what the study is called.
+        settings: name to setting.
+        variants: name to variant.
+        references: floors and ceilings to run in every setting, to the number of their seeds.
+        training: the recipe.
+        episodes: evaluation episodes of a run.
+        eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
+
+    Raises:
+        ValueError: a name or count that no study can be run with.
+    """
+
+    name: str
+    settings: dict[str, Setting]
+    variants: dict[str, Variant]
+    references: dict[str, int] = field(default_factory=dict)
+    training: Training = field(default_factory=Training)
+    episodes: int = 10
+    eval_seed: int = 1000
+
+    def __post_init__(self):
+        for name in (self.name, *self.settings, *self.variants):
+            if not NAME.fullmatch(name):
+                raise InputError(f"'{name}' is no name for a study, setting or variant; use a-z, 0-9, '_' and '-'.")
+        for kind in ("settings", "variants"):
+            if not getattr(self, kind):
+                raise InputError(f"A study needs at least one of {kind}.")
+        names = [*self.settings, *self.variants, *self.references]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise InputError(f"'{twice[0]}' is the name of two things; settings, variants and references differ.")
+        _check_count("episodes", self.episodes)
+        if not 0 <= self.eval_seed < 2**31:
+            raise InputError(f"eval_seed must be a number from 0 to {2**31 - 1}, not {self.eval_seed}.")
+        for name, seeds in self.references.items():
+            _check_count(f"references.{name}", seeds)
+        for name, variant in self.variants.items():
+            _check_count(f"variants.{name}.seeds", variant.seeds)
+            unknown = [setting for setting in variant.settings or [] if setting not in self.settings]
+            if unknown:
+                known = ", ".join(self.settings)
+                raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; there are: {known}.")
+            if "type" not in variant.policy:
+                raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
+
+    def variants_in(self, setting: str) -> dict[str, Variant]:
+        """The variants that run in a setting, by name."""
+        return {name: v for name, v in self.variants.items() if setting in (v.settings or self.settings)}
+
+    def data_of(self, setting: str) -> list[str]:
+        """All demonstrations that the setting's variants are trained on, its own first.
+
+        Every policy of the setting is validated on what is held out of each of them. (The paper validates its policy
+        without noise on demonstrations without noise, section IV.)
+        """
+        data = (variant.data for variant in self.variants_in(setting).values() if variant.data)
+        return list(dict.fromkeys([self.settings[setting].data, *data]))
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a study is run.
+
+    Args:
+        only: make only runs setting/variant/seed_N that fit this, such as `fixed` or `*/seed_[0-4]`; commas between
+            several.
+        together: seeds that are trained and evaluated in one pass.
+        executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
+            store on a file system that all its machines share).
+        workers: processes that generate demonstrations; jobs at a time on a Ray of this machine.
+        retry_failed: make again what failed before.
+
+    Raises:
+        ValueError: a count below 1 or an unknown executor.
+    """
+
+    only: str = ""
+    together: int = 10
+    executor: str = "processes"
+    workers: int = 2
+    retry_failed: bool = False
+
+    def __post_init__(self):
+        for name in ("together", "workers"):
+            _check_count(name, getattr(self, name))
+        if self.executor not in EXECUTORS:
+            raise InputError(f"Unknown executor '{self.executor}'; choose one of: {', '.join(EXECUTORS)}.")
+
+
+def _check_count(name: str, count: int, least: int = 1) -> None:
+    if not (math.isfinite(count) and count >= least):
+        raise InputError(f"{name} must be at least {least}, not {count}.")

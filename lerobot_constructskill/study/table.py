@@ -1,0 +1,140 @@
+"""What there is of a study: its runs as one table of rows, its videos, and what is missing or failed, and why."""
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO, read_facts
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
+from lerobot_constructskill.study.runs import Demonstrations, Run
+from lerobot_constructskill.study.validate import read_error
+
+VIDEOS = "videos"
+
+
+class Table:
+    """The rows of a study's runs, in the study's order; what has been read is kept.
+
+    Args:
+        root: the study's folder.
+        runs: its runs.
+        store: where they are made.
+    """
+
+    def __init__(self, root: Path, runs: Sequence[Run], store: Store):
+        self.root, self.runs, self.store = root, runs, store
+        self._made: dict[str, list[EpisodeRow]] = {}
+        self._rows: dict[str, list[Row]] = {}
+
+    def missing(self) -> list[Run]:
+        """The runs that have not been made."""
+        return [run for run in self.runs if self.episodes(run) is None]
+
+    def failed(self) -> list[Run]:
+        return [run for run in self.runs if (rows := self.episodes(run)) and rows[0].error_kind]
+
+    def episodes(self, run: Run) -> list[EpisodeRow] | None:
+        """The rows of a run; None if it has not been made.
+
+        Raises:
+            InputError: its folder holds something else.
+        """
+        name = run.artifact.digest
+        if name not in self._made and self.store.has(run.artifact):
+            file = self.store.folder(run.artifact) / EPISODES
+            if not file.is_file():
+                raise InputError(f"{file.parent} has no episodes, as no run of ours is left: move it away.")
+            self._made[name] = load_rows(file, EpisodeRow)
+        return self._made.get(name)
+
+    def forget_failure(self, run: Run) -> None:
+        """Discard a run that failed, so that it is made anew, unless somebody has done so."""
+        with self.store.claim([run.artifact]):
+            self._made.pop(run.artifact.digest, None)
+            if (rows := self.episodes(run)) and rows[0].error_kind:
+                self.store.discard(run.artifact)
+                self._made.pop(run.artifact.digest)
+
+    def write(self) -> None:
+        """Write the table and the videos into the study's folder."""
+        write_rows([row for run in self.runs for row in self._rows_of(run)], self.root / ROWS)
+
+    def write_anew(self) -> None:
+        """The same, with held-out errors as they are by now."""
+        self._rows.clear()
+        self.write()
+
+    def _rows_of(self, run: Run) -> list[Row]:
+        if run.id not in self._rows and self.episodes(run) is not None:
+            self._rows[run.id] = list(self._made_rows(run))
+        return self._rows.get(run.id) or [self._missing_row(run)]
+
+    def _missing_row(self, run: Run) -> Row:
+        seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.evaluation["seed"]}
+        return Row(run=run.artifact.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))
+
+    def _made_rows(self, run: Run) -> Iterator[Row]:
+        common, errors = _names(run), self._heldout_errors(run)
+        if errors:
+            common |= {"heldout_mse_m2": errors.get(run.arm.validated_on[0].name)}
+            common |= {"heldout_mse_m2_by_data": json.dumps(errors)}
+        for row in self.episodes(run):
+            yield Row(**asdict(row), **common, video=self._video(run) if row.episode == 0 else None)
+
+    def _heldout_errors(self, run: Run) -> dict[str, float | None]:
+        """The run's error on what is held out of all demonstrations of its setting, by their names."""
+        if run.checkpoint is None or not self.store.has(run.checkpoint):
+            return {}
+        errors = {data.name: self._heldout_error(run, data) for data in run.arm.validated_on}
+        return {name: error for name, error in errors.items() if error is not None}
+
+    def _heldout_error(self, run: Run, data: Demonstrations) -> float | None:
+        if data == run.arm.demonstrations:
+            return read_facts(self.store.folder(run.checkpoint)).get("heldout_mse_m2")
+        return read_error(run, data, self.store)
+
+    def _video(self, run: Run) -> str | None:
+        """Copy the run's video beside the table and return its path there."""
+        video = self.store.folder(run.artifact) / VIDEO
+        if run.seed != FILMED_SEED or not video.exists():
+            return None
+        path = Path(VIDEOS) / f"{run.arm.setting}-{run.arm.name}.mp4"
+        if not (self.root / path).exists() or (self.root / path).stat().st_mtime != video.stat().st_mtime:
+            with replaced(self.root / path) as partial:
+                shutil.copy2(video, partial)
+        return str(path)
+
+
+def _names(run: Run) -> dict[str, Any]:
+    arm = run.arm
+    return {
+        "setting": arm.setting,
+        "variant": arm.name,
+        "role": arm.role,
+        "episodes": arm.evaluation["episodes"],
+        "demonstrations": arm.demonstrations and arm.demonstrations.name,
+    }
+
+
+def status(table: Table) -> str:
+    """A line for every variant and reference of every setting, and one for every reason of a failure."""
+    lines = []
+    for (setting, name), runs in groupby(table.runs, key=lambda run: (run.arm.setting, run.arm.name)):
+        runs = list(runs)
+        made = [rows for run in runs if (rows := table.episodes(run))]
+        failed = [rows[0] for rows in made if rows[0].error_kind]
+        finished, missing = len(made) - len(failed), len(runs) - len(made)
+        lines.append(f"{setting}/{name}: {finished} finished, {len(failed)} failed, {missing} missing")
+        for (kind, error), rows in groupby(failed, key=lambda row: (row.error_kind, row.error)):
+            rows = list(rows)
+            seeds = ", ".join(str(row.training_seed) for row in rows)
+            log = table.store.root / "runs" / rows[0].run / "log.txt"
+            lines.append(f"    seeds {seeds} ({kind}): {error} (log: {log})")
+    return "\n".join(lines)

@@ -1,0 +1,154 @@
+"""What trains a policy type in a study: the class that its configuration names, or `lerobot-train`."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_constructskill.artifacts.digests import distributions_of
+from lerobot_constructskill.artifacts.pools import cores, die_with_parent
+from lerobot_constructskill.artifacts.store import Store
+
+LOADERS = 4
+"""LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
+
+ELSEWHERE = ("device", "push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of every policy that say where it computes or is published, and not what it becomes."""
+
+type Writer = Callable[..., AbstractContextManager[Path]]
+"""Gives the path of a folder that is not there yet; the checkpoint appears when the block ends. It takes what rows are
+to say of the checkpoint: `heldout_mse_m2`, its error on what is held out, and `made_of`, name to what it stands on."""
+
+
+class Trainer:
+    """Trains a policy type. A configuration class names its own as `study_trainer = "module:class"`."""
+
+    seeds_together: bool = False
+    """Whether `fit` should get many seeds at once."""
+    places: tuple[str, ...] = ()
+    """Fields of the configuration that say where something lies and do not show in a checkpoint's weights."""
+    packages: tuple[str, ...] = ()
+    """Distributions beside LeRobot, torch and the configuration's own whose versions may show in them."""
+    heldout_mse: Callable[..., list[float | None]] | None = None
+    """`(checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on episodes of
+    other demonstrations, in m2; None where they lack one of its inputs. Without it, none is validated on others."""
+
+    def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:
+        """Return the configuration with everything written out that it leaves to the machine."""
+        return config
+
+    def fit(
+        self,
+        config: PreTrainedConfig,
+        demonstrations: LeRobotDataset,
+        writers: Mapping[int, Writer],
+        epochs: int,
+        batch_size: int,
+        held_out: Sequence[int],
+        store: Store,
+    ) -> None:
+        """Train each seed of `writers` on the episodes that are not held out, and write its checkpoint.
+
+        A checkpoint is what `lerobot-eval --policy.path` loads.
+        """
+        raise NotImplementedError
+
+
+def trainer_of(config: PreTrainedConfig) -> Trainer:
+    """What trains policies of this configuration."""
+    named = getattr(type(config), "study_trainer", None)
+    if named is None:
+        return LeRobotTrainer()
+    module, name = named.split(":")
+    return getattr(import_module(module), name)()
+
+
+def packages_of(config: PreTrainedConfig) -> tuple[str, ...]:
+    """Distributions whose versions may show in what such a policy learns and does."""
+    return (*trainer_of(config).packages, *distributions_of(type(config)))
+
+
+def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
+    """Every field of a settled configuration that shows in its checkpoint."""
+    fields = draccus.encode(config)
+    for name in (*ELSEWHERE, *trainer_of(config).places):
+        fields.pop(name, None)
+    return {"type": config.type, **fields}
+
+
+class LeRobotTrainer(Trainer):
+    """`lerobot-train`, for as many passes over the same demonstrations as the study says."""
+
+    packages = ("torchvision", "torchcodec", "transformers", "diffusers")
+
+    def fit(
+        self,
+        config: PreTrainedConfig,
+        demonstrations: LeRobotDataset,
+        writers: Mapping[int, Writer],
+        epochs: int,
+        batch_size: int,
+        held_out: Sequence[int],
+        store: Store,
+    ) -> None:
+        kept = sorted({*range(demonstrations.num_episodes)} - {*held_out})
+        frames = sum(demonstrations.meta.episodes["length"][i] for i in kept)
+        steps = epochs * -(-frames // batch_size)
+        command = [
+            str(Path(sys.executable).parent / "lerobot-train"),
+            f"--dataset.repo_id={demonstrations.repo_id}",
+            f"--dataset.root={demonstrations.root}",
+            f"--dataset.episodes={kept}",
+            *_flags(config),
+            "--policy.push_to_hub=false",
+            f"--batch_size={batch_size}",
+            f"--steps={steps}",
+            f"--save_freq={steps}",
+            "--env_eval_freq=0",
+            f"--num_workers={min(cores() - 1, LOADERS)}",
+        ]
+        for seed, write in writers.items():
+            with write() as folder:
+                output = folder.with_name(f"lerobot-train-{os.getpid()}")
+                said = _call([*command, f"--seed={seed}", f"--output_dir={output}"])
+                (output / "checkpoints" / "last" / "pretrained_model").resolve().rename(folder)
+                (folder / "lerobot-train.log").write_text(said)
+
+
+def _flags(config: PreTrainedConfig) -> list[str]:
+    """The fields that are not their type's defaults, as LeRobot's flags."""
+    default = draccus.encode(PreTrainedConfig.get_choice_class(config.type)(device=config.device))
+    given = {name: value for name, value in draccus.encode(config).items() if value != default[name]}
+    flags = {"type": config.type, "device": config.device, **given}
+    return [f"--policy.{name}={v if isinstance(v, str) else json.dumps(v)}" for name, v in flags.items()]
+
+
+def _call(command: list[str]) -> str:
+    """Run a command and return what it said.
+
+    Raises:
+        RuntimeError: it failed; all that it said is the exception's note.
+    """
+    done = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        preexec_fn=die_with_parent,
+    )
+    if done.returncode:
+        lines = done.stdout.strip().splitlines() or ["nothing"]
+        error = RuntimeError(f"lerobot-train ended with status {done.returncode} and said last: {lines[-1]}")
+        error.add_note(done.stdout)
+        raise error
+    return done.stdout

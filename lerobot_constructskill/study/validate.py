@@ -1,0 +1,51 @@
+"""Held-out errors on other demonstrations of a setting than those that a policy was trained on."""
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
+from lerobot_constructskill.study.trainers import trainer_of
+
+FILE = "heldout.json"
+
+logger = logging.getLogger(__name__)
+
+
+def validate(runs: Sequence[Run], store: Store, workers: int = 1) -> None:
+    """Measure whatever has not been measured; what cannot be is logged and stays unknown."""
+    arms = {id(run.arm): run.arm for run in runs if run.arm.policy and trainer_of(run.arm.policy).heldout_mse}
+    pairs = [(arm, data) for arm in arms.values() for data in arm.validated_on if data != arm.demonstrations]
+    for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
+        own = [run for run in runs if run.arm is arm and store.has(run.checkpoint)]
+        missing = [run for run in own if not store.has(run.heldout(data))]
+        try:
+            if missing:
+                _measure(arm, missing, data, store, workers)
+        except Exception as error:
+            logger.warning("%s/%s is not validated on %s: %s", arm.setting, arm.name, data.name, error)
+            store.note(missing[0].heldout(data), error)
+
+
+def read_error(run: Run, data: Demonstrations, store: Store) -> float | None:
+    """What was measured, in m2."""
+    made = run.heldout(data)
+    return json.loads((store.folder(made) / FILE).read_text())["mse_m2"] if store.has(made) else None
+
+
+def _measure(arm: Arm, runs: Sequence[Run], data: Demonstrations, store: Store, workers: int) -> None:
+    dataset = obtain_demonstrations(replace(data.config, workers=workers), store)
+    episodes = held_out(dataset.num_episodes, arm.training.holdout)
+    with store.claim([run.heldout(data) for run in runs]) as missing:
+        runs = [run for run in runs if run.heldout(data) in missing]
+        checkpoints = [store.folder(run.checkpoint) for run in runs]
+        errors = trainer_of(arm.policy).heldout_mse(checkpoints, dataset, episodes, store)
+        for run, error in zip(runs, errors, strict=True):
+            with store.writing(run.heldout(data)) as folder:
+                folder.mkdir()
+                (folder / FILE).write_text(json.dumps({"mse_m2": error}) + "\n")

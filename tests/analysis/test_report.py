@@ -1,0 +1,314 @@
+"""The report of studies that were never run: what it says, what it refuses, and that nothing in it is markup."""
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from synthetic_study import (
+    HOSTILE,
+    RATES,
+    SMALL,
+    STUDY,
+    episode_rows,
+    failed_row,
+    missing_row,
+    missing_rows,
+    planned,
+    study_rows,
+    write_study,
+)
+
+from lerobot_constructskill.analysis.report import ink
+from lerobot_constructskill.analysis.report.answer import answer, status
+from lerobot_constructskill.analysis.report.collect import collect
+from lerobot_constructskill.analysis.report.page import read_study
+from lerobot_constructskill.analysis.report.wording import p_value, roman, signed
+from lerobot_constructskill.analysis.stats.comparisons import Verdict
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.scripts.report import ReportConfig, report
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+class Reader(HTMLParser):
+    """Tags, attributes and text of a page."""
+
+    def __init__(self, page: str):
+        super().__init__()
+        self.tags, self.links, self.text = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "srcset", "poster", "data")]
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def findings_of(study: dict, rows, folder: Path, **analysis):
+    heading, table = read_study(write_study(folder, study, rows, **analysis))
+    return collect(heading.analysis, table)
+
+
+@pytest.fixture
+def no_figures(monkeypatch):
+    """Figures take most of a report's time."""
+    monkeypatch.setattr(ink, "encoded", lambda drawing, paper, *formats: [b""] * len(formats))
+
+
+def test_page_holds_the_papers_tables_and_every_figure(study):
+    reader = Reader((study / "report.html").read_text())
+    text = re.sub(r"\s+", " ", " ".join(reader.text))
+    for words in ("Table I.", "Table II.", "DINOv2 ViT-S/14, first 3 seeds", "Position ± 0.10 m", "Scripted expert"):
+        assert words in text
+    figures = {path.name for path in (study / "figures").iterdir()}
+    names = [f"{setting}_{kind}" for setting in RATES for kind in ("outcomes", "seeds", "error", "ranking")]
+    assert figures == {f"{name}.png" for name in [*names, "detectable_difference"]}
+    assert reader.tags.count("img") == reader.tags.count("source") == len(names) + 1
+    assert (study / "study.yaml").read_text() in "".join(reader.text)
+
+
+def test_every_variant_is_validated_on_every_set_of_the_setting(study):
+    markdown = (study / "report.md").read_text()
+    fixed, moved = (part for part in markdown.split("Error on what is held out of each set")[1:])
+    for part in (fixed, moved):
+        assert "| configuration | trained on | fast | fast\\_noise\\_free |\n|---|---|---:|---:|\n" in part
+    (row,) = [line for line in fixed.splitlines() if line.startswith("| No noise injection | fast\\_noise\\_free |")]
+    on_noisy, on_noise_free = (float(cell.split("[")[0].replace("\\", "")) for cell in row.split("|")[3:5])
+    assert on_noise_free == pytest.approx(on_noisy / 2, abs=0.01)
+    assert "fast_noise_free" in (study / "report.html").read_text()
+
+
+def test_page_is_one_file_without_script(study):
+    reader = Reader((study / "report.html").read_text())
+    assert "script" not in reader.tags and "table" in reader.tags
+    outside = [link for link in reader.links if not link.startswith(("data:", "#", "figures/"))]
+    assert outside == ["videos/large.mp4"]
+    assert reader.tags.count("video") == 1
+
+
+def test_everything_is_escaped(study):
+    page, markdown = (study / "report.html").read_text(), (study / "report.md").read_text()
+    assert HOSTILE in " ".join(Reader(page).text).replace("  ", " ")
+    assert "<script" not in page + markdown
+    (line,) = [line for line in markdown.splitlines() if "alert" in line and line.startswith("|")]
+    assert len(re.findall(r"(?<!\\)\|", line)) == 5
+    assert "\\*żółć\\*" in line and "煉瓦" in line
+
+
+def test_report_says_what_is_missing_and_what_failed(study):
+    markdown = (study / "report.md").read_text()
+    assert "1 of 82 runs is missing" in markdown
+    assert "1 run failed and counts as a seed" in markdown
+    (row,) = [line for line in markdown.splitlines() if line.startswith("| CLIP ViT-B/16 |")][:1]
+    assert "/9" in row
+    assert "9 of 10 seeds so far" in (study / "report.html").read_text()
+
+
+def test_a_run_that_was_not_made_is_neither_a_failure_nor_a_zero(tmp_path):
+    runs = list(planned(SMALL))
+    rows = [row for run in runs[:3] for row in episode_rows(SMALL, run, 2, 2)] + [missing_row(SMALL, runs[3])]
+    (setting,) = (findings := findings_of(SMALL, rows, tmp_path)).settings
+    one, two = setting.lines
+    assert (findings.planned, findings.missing) == (4, 1)
+    assert (two.seeds, two.failed, len(two.runs)) == (2, 0, 1)
+    assert two.outcomes["placed"].counts == (1, 1) and two.outcomes["placed"].mean.value == 1
+    assert [(pair.counts_a, pair.counts_b) for pair in setting.comparisons["placed"]] == [((2, 2), (1, 1))]
+    assert setting.failures == [] and findings.repeated == (3, 3)
+    assert status(findings) == "1 of 4 runs is missing: every number below is provisional."
+
+
+def test_a_reference_that_was_not_made_is_missing(tmp_path):
+    study = SMALL | {"references": {"expert": 1}}
+    rows = [row for run in planned(study) for row in episode_rows(study, run, 2, 2)]
+    findings = findings_of(study, [missing_row(study, ("fixed", "expert", 0)), *rows], tmp_path)
+    assert (findings.missing, findings.planned_references) == (0, 1)
+    assert status(findings) == "References without a result: expert (fixed)."
+    assert findings.settings[0].references[0].absence == "not run yet"
+
+
+@pytest.fixture(scope="module")
+def findings(tmp_path_factory):
+    return findings_of(STUDY, study_rows(), tmp_path_factory.mktemp("complete"))
+
+
+def test_the_answer_is_made_from_the_numbers(findings):
+    assert status(findings) is None
+    (_, fixed), (_, moved) = answer(findings)
+    best = max(findings.settings[0].tables[0].lines, key=lambda line: line.outcomes["placed"].counts)
+    assert f"{best.label} placed the object in {best.outcomes['placed'].counts.met} of 10 seeds" in fixed
+    assert "DINOv2 ViT-S/14 beats ViT-Tiny/16" in fixed
+    sightless = "replay of one demonstration places in 10 of 10 episodes and blind places in 10 of 10 episodes without"
+    assert sightless in fixed and "does not show that a policy sees" in fixed and "policy sees" not in moved
+    assert "Seeds succeed in some of their episodes here" in moved
+
+
+def test_tables_group_by_seeds_and_repeat_the_baseline(findings):
+    backbones, ablations = findings.settings[0].tables
+    assert (backbones.seeds, backbones.baseline, ablations.seeds) == (10, None, 3)
+    assert list(ablations.baseline.runs["training_seed"]) == [0, 1, 2]
+
+
+def test_what_a_setting_is_read_with_comes_from_the_rows(findings):
+    fixed, moved = findings.settings
+    assert fixed.data_sets == ["fast", "fast_noise_free"]
+    assert [line.demonstrations for line in moved.lines] == ["fast"] * 4 + ["fast_noise_free"]
+    assert [line.name for line in fixed.lines] == list(STUDY["variants"])
+    assert (findings.episodes, findings.first_seed, findings.planned, findings.planned_references) == (
+        10,
+        1000,
+        82,
+        10,
+    )
+    assert (fixed.declared, moved.declared) == (6 + 1, 3 + 1)
+
+
+def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_figures):
+    """Not even one by resampling."""
+    root = write_study(tmp_path)
+    rows = (root / "rows.parquet").read_bytes()
+
+    def page(**analysis) -> list[str]:
+        write_study(root, **analysis)
+        (root / "rows.parquet").write_bytes(rows)
+        report(ReportConfig(root))
+        return (root / "report.html").read_text().split("<details>")[0].splitlines()
+
+    first = page()
+    labels = STUDY["analysis"]["labels"] | {"dinov2": "Renamed"}
+    assert [line.replace("Renamed", "DINOv2 ViT-S/14") for line in page(labels=labels)] == first
+    # The first variant is also the one whose first seeds stand beside ablations, so it stays first.
+    ordered = page(order=["dinov2", "vit_tiny"])
+    assert ordered != first
+    rows_of = [sorted(line for line in text if line.startswith(("<tr>", "<td"))) for text in (first, ordered)]
+    assert rows_of[0] == rows_of[1]
+    strict = page(alpha=1e-9)
+    assert "DINOv2 ViT-S/14 is better" in "".join(first) and "is better" not in "".join(strict)
+
+
+def test_declared_comparisons_are_the_family(tmp_path):
+    findings = findings_of(STUDY, study_rows(), tmp_path, comparisons=[["clip", "dinov2"], ["augreg", "dinov2"]])
+    fixed, moved = findings.settings
+    assert [(pair.a, pair.b) for pair in fixed.comparisons["placed"]] == [("clip", "dinov2"), ("augreg", "dinov2")]
+    assert moved.declared == 1  # augreg does not run there
+
+
+@pytest.mark.parametrize(
+    ("analysis", "said"),
+    [
+        ({"comparisons": [["one", "b"]]}, "Unknown variant in comparisons 'b'; there are: one, two."),
+        ({"order": ["b"]}, "Unknown variant in order 'b'; there are: one, two."),
+        ({"labels": {"b": "B"}}, "Unknown name in labels 'b'; there are: one, two, fixed."),
+        ({"comparisons": [["one"]]}, "A comparison is a pair of variants"),
+        ({"comparisons": [["one", "one"]]}, "A comparison is a pair of variants"),
+        ({"alpha": 1.0}, "alpha must lie between 0 and 1, not 1.0"),
+        ({"alpha": float("nan")}, "alpha must lie between 0 and 1, not nan"),
+        ({"alhpa": 0.1}, "alhpa"),
+    ],
+)
+def test_an_analysis_that_does_not_fit_is_refused_in_a_sentence(analysis, said, tmp_path):
+    with pytest.raises(InputError, match=re.escape(said)):
+        report(ReportConfig(write_study(tmp_path, SMALL, missing_rows(SMALL), **analysis)))
+
+
+def test_report_is_the_same_twice(tmp_path):
+    rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, 1, run[2])]
+    root = write_study(tmp_path, SMALL, rows)
+    first, second = ({path: path.read_bytes() for path in files(root)} for _ in range(2))
+    assert first == second and len(first) > 6
+
+
+def files(root: Path) -> list[Path]:
+    report(ReportConfig(root))
+    return [path for path in root.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("met", [0, 2])
+def test_studies_at_the_ends(met, tmp_path):
+    """All or none of the seeds succeed, no run has a held-out error, and nothing can be told apart."""
+    rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, met, met)]
+    (setting,) = findings_of(SMALL, rows, tmp_path).settings
+    assert [pair.verdict for pair in setting.comparisons["placed"]] == [Verdict.INCONCLUSIVE]
+    assert setting.correlations["placed"][0][1] is None
+    report(ReportConfig(tmp_path))
+    assert not list((tmp_path / "figures").glob("*_error.*"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "error", "shown", "said"),
+    [
+        ("machine", "Out of memory.", "no run finished: Out of memory.", "No run of two (fixed) finished."),
+        ("weights", "clip_vitb16: log in to the Hub.", "weights not available", "Weights not available: two."),
+    ],
+)
+def test_a_variant_that_could_not_run_is_never_a_zero(kind, error, shown, said, tmp_path, no_figures):
+    rows = episode_rows(SMALL, ("fixed", "one", 0), 2, 2) + episode_rows(SMALL, ("fixed", "one", 1), 2, 0)
+    rows += [failed_row(SMALL, ("fixed", "two", seed), error, kind) for seed in range(2)]
+    findings = findings_of(SMALL, rows, tmp_path)
+    one, two = findings.settings[0].lines
+    assert one.outcomes["placed"].counts.met == 1
+    assert not two.outcomes and two.absence == shown
+    assert findings.settings[0].comparisons["placed"] == []
+    assert status(findings) == said
+    report(ReportConfig(tmp_path))
+    markdown = (tmp_path / "report.md").read_text()
+    assert f"| two | {shown.replace('_', chr(92) + '_')} |" in markdown
+    assert error.replace("_", "\\_") in markdown.split("## Failed runs")[1]
+
+
+def test_a_study_without_any_run_gets_a_report(tmp_path):
+    report(ReportConfig(write_study(tmp_path, SMALL, missing_rows(SMALL))))
+    markdown = (tmp_path / "report.md").read_text()
+    assert "4 of 4 runs are missing" in markdown and "No run has finished." in markdown
+
+
+def test_what_cannot_be_reported_is_refused_in_a_sentence(tmp_path):
+    rows = episode_rows(SMALL, ("fixed", "one", 0), 1, 1)
+    with pytest.raises(InputError, match="stands in the rows twice"):
+        report(ReportConfig(write_study(tmp_path / "twice", SMALL, rows + rows[:1])))
+    longer = episode_rows(SMALL | {"episodes": 5}, ("fixed", "one", 1), 1, 1)
+    with pytest.raises(InputError, match="Runs of 2 and of 5 episodes"):
+        report(ReportConfig(write_study(tmp_path / "mixed", SMALL, rows + longer)))
+    with pytest.raises(InputError, match="has no rows"):
+        report(ReportConfig(write_study(tmp_path / "empty", SMALL, [])))
+    with pytest.raises(InputError, match="Setting 'fixed' has no variant"):
+        report(ReportConfig(write_study(tmp_path / "bare", SMALL, episode_rows(SMALL, ("fixed", "expert", 0), 2, 2))))
+
+
+@pytest.mark.parametrize("name", ["study.yaml", "rows.parquet"])
+def test_a_folder_that_is_no_studys_is_refused_in_a_sentence(name, tmp_path):
+    root = write_study(tmp_path, SMALL, missing_rows(SMALL))
+    for content in ("name: [small", "- small", "analysis: {}", ""):
+        (root / name).write_text(content)
+        with pytest.raises(InputError, match=f"{name}' (is not a study's file|cannot be read): "):
+            report(ReportConfig(root))
+    (root / name).unlink()
+    with pytest.raises(MissingError, match=f"'{root}' is no folder of a study: {name} is missing."):
+        report(ReportConfig(root))
+
+
+def test_numbers_as_they_are_written():
+    assert [p_value(p) for p in (0.00001, 0.0031, 0.087, 0.65)] == ["< 0.0001", "0.0031", "0.087", "0.65"]
+    assert [signed(value, 2) for value in (0.2, -0.2, -0.001)] == ["+0.20", "−0.20", "0.00"]
+    assert [roman(number) for number in (1, 4, 9, 14, 40)] == ["I", "IV", "IX", "XIV", "XL"]
+
+
+COMMAND = """
+import sys
+sys.argv = ["constructskill-report", "--root={root}"]
+from lerobot_constructskill.scripts.report import main
+main()
+print({{"torch", "lerobot", "sapien", "mani_skill"}} & set(sys.modules))
+"""
+
+
+def test_command_imports_neither_torch_nor_lerobot_nor_simulator(tmp_path):
+    write_study(tmp_path, SMALL, missing_rows(SMALL))
+    code = COMMAND.format(root=tmp_path)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [f"Report written to {tmp_path / 'report.html'}", "set()"]

@@ -1,0 +1,71 @@
+"""The published results are what their rows say, and what they said when they were published."""
+
+import shutil
+from pathlib import Path, PurePosixPath
+
+import pytest
+import yaml
+
+from lerobot_constructskill.analysis.report import ink
+from lerobot_constructskill.scripts.report import ReportConfig, report
+
+ROOT = Path(__file__).parents[2]
+RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/study.yaml"))
+PUBLISHED = Path(__file__).parent / "published"
+"""The lines of tables of every page as it was first published, before rows knew of runs."""
+
+LARGEST = 5_000_000
+
+
+def load(path: Path) -> dict:
+    return yaml.safe_load(path.read_text())
+
+
+def last(data: str | None) -> str | None:
+    """A configuration of demonstrations by the last part of its name or path."""
+    return data and PurePosixPath(data).name.removesuffix(".yaml")
+
+
+def variant(fields: dict) -> dict:
+    policy = {name: value for name, value in fields["policy"].items() if name != "backbone_precision"}
+    return {
+        "policy": policy,
+        "data": last(fields.get("data")),
+        "settings": fields.get("settings"),
+        "training": fields.get("training") or {},
+    }
+
+
+def test_every_published_study_has_its_tables():
+    assert [folder.name for folder in RESULTS] == sorted(path.stem for path in PUBLISHED.iterdir())
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_published_study_is_one_of_configs_with_as_many_seeds_or_fewer(folder):
+    """Its precision is the kind of CPU's, and not compared."""
+    study, config = load(folder / "study.yaml"), load(ROOT / "configs" / "study" / f"{folder.name}.yaml")
+    for part in ("name", "episodes"):
+        assert study[part] == config[part]
+    assert study["eval_seed"] == config.get("eval_seed", 1000)
+    assert config.get("training", {}).items() <= study["training"].items()
+    for name, setting in config["settings"].items():
+        assert study["settings"][name]["env"] == setting["env"]
+        assert last(study["settings"][name]["data"]) == last(setting["data"])
+    for part in ("settings", "variants", "references"):
+        assert study[part].keys() == config.get(part, {}).keys()
+    for name, fields in config["variants"].items():
+        assert variant(study["variants"][name]) == variant(fields)
+        assert study["variants"][name]["seeds"] <= fields.get("seeds", 10)
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
+    """Its Markdown, that is: the figures are not drawn, which takes most of a report's time."""
+    monkeypatch.setattr(ink, "encoded", lambda drawing, paper, *formats: [b""] * len(formats))
+    copy = shutil.copytree(folder, tmp_path / folder.name)
+    report(ReportConfig(copy))
+    page = (copy / "report.md").read_text()
+    assert page == (folder / "report.md").read_text()
+    tables = [line for line in page.splitlines() if line.startswith("|")]
+    assert tables == (PUBLISHED / f"{folder.name}.txt").read_text().splitlines()
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < LARGEST

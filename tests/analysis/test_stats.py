@@ -1,0 +1,261 @@
+"""Statistics on seeds: the paper's own numbers, and what must hold for any numbers."""
+
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import binom, bootstrap, kendalltau
+
+from lerobot_constructskill.analysis.stats.comparisons import (
+    Verdict,
+    boschloo,
+    compare,
+    fisher,
+    holm,
+    probability_better,
+)
+from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
+from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, newcombe
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count, seed_outcomes
+from lerobot_constructskill.analysis.stats.power import detectable_difference, power, seeds_needed, wrong_order
+from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate, spread, spread_p_value
+from lerobot_constructskill.study.rows import NOT_RUN
+
+# Paper, Tables I and II: seeds that lifted, seeds that placed, seeds.
+BACKBONES = {"dinov2": (10, 7, 10), "clip": (6, 5, 10), "vit_tiny": (3, 1, 10), "vit_tiny_augreg": (2, 1, 10)}
+LIFTED = {name: Counts(lifted, seeds) for name, (lifted, _, seeds) in BACKBONES.items()}
+PLACED = {name: Counts(placed, seeds) for name, (_, placed, seeds) in BACKBONES.items()}
+BASELINE, NOISE_FREE = Counts(3, 3), Counts(0, 3)
+PAIRS = list(combinations(BACKBONES, 2))
+
+# Where shares and numbers of seeds are at their ends, and between.
+ARMS = [Counts(met, seeds) for seeds in (1, 3, 10) for met in {0, 1, seeds // 2, seeds}]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("counts", "other", "p_value", "digits"),
+    [(LIFTED, "vit_tiny", 0.0031, 4), (LIFTED, "vit_tiny_augreg", 0.0007, 4), (LIFTED, "clip", 0.087, 3)]
+    + [(PLACED, "clip", 0.65, 2)],
+)
+def test_fisher_gives_the_papers_four_p_values(counts, other, p_value, digits):
+    assert round(fisher(counts["dinov2"], counts[other]), digits) == p_value
+
+
+def test_what_the_paper_does_not_say():
+    """Spec, section 5, last paragraph."""
+    assert round(fisher(BASELINE, NOISE_FREE), 2) == 0.10
+    comparison = compare(LIFTED, PAIRS)[PAIRS.index(("dinov2", "clip"))]
+    assert round(comparison.boschloo, 3) == 0.042
+    assert round(comparison.holm, 2) == 0.17
+    assert comparison.verdict is Verdict.INCONCLUSIVE
+    assert seeds_needed(0.7, 0.5) == 93
+    assert round(wrong_order(0.7, 0.5, 10), 2) == 0.12
+    assert round(wrong_order(0.7, 0.5, 3), 2) == 0.17
+    assert round(probability_better(PLACED["dinov2"], PLACED["clip"]), 2) == 0.81
+
+
+def test_published_intervals():
+    """Newcombe 1998, table II, row (a), method 10: 56/70 - 48/80; Clopper-Pearson of 10/10 is 0.025^(1/10)."""
+    assert newcombe(Counts(56, 70), Counts(48, 80))[1:] == pytest.approx((0.0524, 0.3339), abs=1e-4)
+    assert clopper_pearson(Counts(10, 10)).low == pytest.approx(0.025**0.1)
+
+
+@pytest.mark.parametrize("counts", ARMS, ids=str)
+def test_intervals_hold_their_estimate_and_lie_in_range(counts):
+    estimate = clopper_pearson(counts)
+    assert 0 <= estimate.low <= estimate.value == counts.rate <= estimate.high <= 1
+    wide, narrow = clopper_pearson(counts, 0.99), clopper_pearson(counts, 0.9)
+    assert wide.low <= narrow.low and narrow.high <= wide.high
+
+
+def test_intervals_narrow_with_seeds():
+    intervals = [clopper_pearson(Counts(n // 2, n)) for n in (2, 10, 30, 100)]
+    widths = [interval.high - interval.low for interval in intervals]
+    assert widths == sorted(widths, reverse=True)
+
+
+def test_an_interval_needs_a_seed():
+    for call in (clopper_pearson, lambda counts: newcombe(counts, BASELINE)):
+        with pytest.raises(ValueError, match="at least one seed"):
+            call(Counts(0, 0))
+
+
+@pytest.mark.parametrize(("a", "b"), list(combinations(ARMS, 2)), ids=str)
+def test_swapping_the_arms_changes_signs_only(a, b):
+    assert fisher(a, b) == pytest.approx(fisher(b, a))
+    assert boschloo(a, b) == pytest.approx(boschloo(b, a), abs=1e-6)
+    assert probability_better(a, b) == pytest.approx(1 - probability_better(b, a), abs=1e-6)
+    assert newcombe(a, b) == pytest.approx([-newcombe(b, a)[i] for i in (0, 2, 1)])
+    assert newcombe(a, b).low <= newcombe(a, b).value <= newcombe(a, b).high
+
+
+@pytest.mark.parametrize("seeds", [3, 10])
+def test_boschloo_is_never_weaker_than_fisher(seeds):
+    for met_a, met_b in combinations(range(seeds + 1), 2):
+        a, b = Counts(met_a, seeds), Counts(met_b, seeds)
+        assert boschloo(a, b) <= fisher(a, b) + 1e-6
+
+
+def test_probability_better_of_many_seeds():
+    assert probability_better(Counts(5000, 10000), Counts(4000, 10000)) == pytest.approx(1)
+    assert probability_better(Counts(4000, 10000), Counts(4000, 10000)) == pytest.approx(0.5)
+
+
+def test_holm_only_raises_and_counts_what_was_not_made():
+    p_values = [0.04, 0.001, 0.3]
+    assert holm(p_values) == pytest.approx([0.08, 0.003, 0.3])
+    assert holm(p_values, family=6) == pytest.approx([0.2, 0.006, 1.0])
+    assert all(corrected >= raw for corrected, raw in zip(holm(p_values), p_values, strict=True))
+    assert holm([]) == []
+
+
+def test_verdicts():
+    counts = {"all": Counts(30, 30), "every": Counts(30, 30), "half": Counts(15, 30), "three": Counts(3, 3)}
+    pairs = [("all", "half"), ("half", "all"), ("all", "every"), ("half", "three"), ("all", "absent")]
+    comparisons = compare(counts, pairs)
+    verdicts = [Verdict.BETTER, Verdict.WORSE, Verdict.ALIKE, Verdict.INCONCLUSIVE]
+    assert [comparison.verdict for comparison in comparisons] == verdicts
+    assert comparisons[0].holm == pytest.approx(5 * comparisons[0].boschloo)
+
+
+def test_power_grows_with_seeds_and_difference():
+    assert power(0.7, 0.7, 20) < 0.05
+    over_seeds = [power(0.9, 0.4, seeds) for seeds in (3, 10, 20, 30)]
+    over_rates = [power(0.9, rate, 20) for rate in (0.8, 0.6, 0.4, 0.2)]
+    assert over_seeds == sorted(over_seeds) and over_rates == sorted(over_rates)
+
+
+def test_what_can_be_detected_is_detected():
+    assert detectable_difference(1.0, 3) is None
+    drops = [detectable_difference(1.0, seeds) for seeds in (10, 20, 40)]
+    assert drops == sorted(drops, reverse=True)
+    assert power(1.0, 1.0 - drops[0], 10) == pytest.approx(0.8, abs=1e-3)
+    needed = seeds_needed(1.0, 0.5)
+    assert seeds_needed(0.5, 1.0) == needed > seeds_needed(1.0, 0.2)
+    assert seeds_needed(0.3, 0.3) is None
+    over_rates = [seeds_needed(1.0, rate / 30) for rate in range(30)]
+    assert over_rates == sorted(over_rates) and over_rates[0] >= 2
+
+
+def test_wrong_orders(rng):
+    chances = [wrong_order(0.7, 0.5, seeds) for seeds in (3, 10, 30, 100)]
+    assert chances == sorted(chances, reverse=True) and 0 < chances[-1] < 0.01
+    assert wrong_order(0.7, 0.5, 1) == pytest.approx(0.3 * 0.5)
+    assert wrong_order(0.5, 0.7, 10) == wrong_order(0.7, 0.5, 10)
+    seeds = rng.binomial(10, [[0.7], [0.5]], (2, 100_000))
+    assert wrong_order(0.7, 0.5, 10) == pytest.approx(np.mean(seeds[0] < seeds[1]), abs=0.005)
+    ties = sum(binom.pmf(range(11), 10, 0.6) ** 2)
+    assert wrong_order(0.6, 0.6, 10) == pytest.approx((1 - ties) / 2)
+
+
+RATES = [np.ones(10), np.zeros(3), np.array([1.0]), np.array([1.0, 0, 0, 1, 0.3]), np.linspace(0, 1, 30)]
+
+
+@pytest.mark.parametrize("rates", RATES, ids=len)
+def test_mean_and_spread_hold_their_estimate(rates, rng):
+    for estimate, top in ((mean_rate(rates, rng), 1.0), (spread(rates, rng), 0.5)):
+        assert 0 <= estimate.low <= estimate.value <= estimate.high <= top
+        assert estimate.low < estimate.high
+
+
+def test_mean_of_all_or_nothing_seeds_has_the_beta_posterior(rng):
+    estimate = mean_rate(np.repeat([1.0, 0.0], [7, 3]), rng)
+    assert estimate[1:] == pytest.approx((0.390, 0.891), abs=0.02)  # quantiles of Beta(8, 4)
+
+
+@pytest.mark.parametrize("method", ["percentile", "basic", "BCa"])
+@pytest.mark.filterwarnings("ignore:.*BCa|.*encountered in")
+def test_scipys_bootstrap_is_certain_of_ten_equal_seeds(method, rng):
+    """Why the resampling of mean and spread is our own."""
+    interval = bootstrap((np.ones(10),), np.mean, method=method, rng=rng).confidence_interval
+    assert not interval.high - interval.low > 0
+    assert mean_rate(np.ones(10), rng).low == pytest.approx(0.025 ** (1 / 11), abs=0.01)  # Beta(11, 1)
+
+
+def test_spread_test(rng):
+    half, full = np.repeat([1.0, 0.0], [5, 5]), np.ones(10)
+    assert spread_p_value(half, half, rng) == 1
+    assert spread_p_value(half, full, rng) == pytest.approx(fisher(Counts(5, 10), Counts(10, 10)), abs=0.01)
+    assert spread_p_value(full, half, rng) == pytest.approx(spread_p_value(half, full, rng), abs=0.01)
+    assert spread_p_value(np.repeat([1.0, 0.0], [1, 9]), np.repeat([1.0, 0.0], [9, 1]), rng) == 1
+    assert spread_p_value(np.repeat([1.0, 0.0], [15, 15]), np.full(30, 0.5), rng) < 0.001
+
+
+def test_mean_test(rng):
+    half, full = np.repeat([1.0, 0.0], [5, 5]), np.ones(10)
+    assert mean_p_value(half, full, rng) == pytest.approx(fisher(Counts(5, 10), Counts(10, 10)), abs=0.01)
+    assert mean_p_value(np.linspace(0, 0.2, 8), np.linspace(0.3, 0.5, 8), rng) < 0.01
+    assert mean_p_value(np.ones(1), np.zeros(1), rng) == 1
+
+
+@pytest.mark.parametrize("test", [mean_p_value, spread_p_value])
+def test_permutation_tests_keep_their_level(test, rng):
+    p_values = [test(*rng.choice([0.0, 0.5, 1.0], (2, 4)), rng) for _ in range(200)]
+    assert np.mean(np.array(p_values) < 0.05) <= 0.08
+
+
+def test_kendall_finds_order_and_none(rng):
+    error, one = np.arange(20.0), np.full(20, "one")
+    ordered = kendall(error, -error, one, rng)
+    assert ordered.tau.value == pytest.approx(-1) and ordered.p_value < 0.01
+    none = kendall(error, np.tile([0.0, 10.0], 10), one, rng)
+    assert -1 <= none.tau.low < 0 < none.tau.high <= 1 and none.p_value > 0.1
+
+
+def test_a_better_variant_with_a_lower_error_is_no_order_within_variants(rng):
+    """Why the test is our own: scipy's takes pairs of two variants with the others."""
+    variant = np.repeat(["good", "bad"], 20)
+    error = np.repeat([1.0, 9.0], 20) + rng.random(40)
+    success = np.repeat([8.0, 1.0], 20) + rng.integers(0, 2, 40)
+    assert abs(kendalltau(error, success).statistic) > 0.5 and kendalltau(error, success).pvalue < 1e-4
+    within = kendall(error, success, variant, rng)
+    assert abs(within.tau.value) < 0.4 and within.p_value > 0.05
+
+
+@pytest.mark.parametrize("successes", [1, 3])
+def test_kendalls_p_value_keeps_its_level_where_few_succeed(successes, rng):
+    p_values = []
+    for _ in range(100):
+        success = rng.permutation([1.0] * successes + [0.0] * (20 - successes))
+        p_values.append(kendall(rng.random(20), success, np.repeat(["a", "b"], 10), rng).p_value)
+    assert np.mean(np.array(p_values) < 0.05) <= 0.1
+
+
+def test_resampled_tau_is_scipys(rng):
+    x, y = rng.integers(0, 4, (2, 5, 12)).astype(float)
+    assert _tau_b(x, y, [np.arange(12)]) == pytest.approx(
+        [kendalltau(a, b).statistic for a, b in zip(x, y, strict=True)]
+    )
+
+
+def test_kendall_needs_errors_and_outcomes_that_differ(rng):
+    nothing = np.full(10, np.nan)
+    for error, success in [(nothing, np.arange(10)), (np.arange(10), np.ones(10)), (np.arange(4), np.arange(4))]:
+        assert kendall(error, success, np.zeros(len(error)), rng) is None
+    assert kendall(np.arange(10), np.repeat([0, 1], 5), np.repeat([0, 1], 5), rng) is None  # only between variants
+    error, one = np.array([*range(9), np.nan]), np.zeros(10)
+    assert kendall(error, -error, one, np.random.default_rng(0)) == kendall(
+        error[:9], -error[:9], one[:9], np.random.default_rng(0)
+    )
+
+
+def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_one_is_none():
+    episode = {"setting": "s", "variant": "v", "error_kind": None, "error": None}
+    episode |= {"heldout_mse_m2": 1e-4, "heldout_mse_m2_by_data": None}
+    rows = [episode | {"training_seed": 0, "lifted": True, "placed": index > 0} for index in range(2)]
+    for seed, kind in ((1, "machine"), (2, NOT_RUN)):
+        rows.append(episode | {"training_seed": seed, "lifted": None, "placed": None, "error_kind": kind})
+    kinds = {"lifted": "boolean", "placed": "boolean", "error_kind": "string", "error": "string"}
+    table = pd.DataFrame(rows).astype(kinds)
+    runs = seed_outcomes(table)
+    assert count(runs, "lifted") == count(runs, "placed") == Counts(1, 2)
+    assert runs["placed_rate"].tolist() == [0.5, 0.0] and runs["episodes"].tolist() == [2, 0]
+    assert runs["error_kind"].isna().tolist() == [True, False]
+    assert count(seed_outcomes(table[table["training_seed"] == 1]), "lifted") == Counts(0, 1)
+    assert seed_outcomes(table[table["training_seed"] == 2]).empty

@@ -1,0 +1,107 @@
+"""The card says of a data set what the data say, and the cards that are kept here are what their facts render to."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from lerobot_constructskill.contract import CAMERAS, FPS, TASKS
+from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
+from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.modality import modality
+
+CARDS = Path(__file__).parents[2] / "datasets_cards"
+
+
+@pytest.fixture(scope="module")
+def data(pristine):
+    return open_dataset(pristine)
+
+
+@pytest.fixture(scope="module")
+def card(data):
+    return render(card_facts(data))
+
+
+def test_every_column_of_every_task_has_its_meaning():
+    for task in TASKS.values():
+        features = demonstration_features(task, "pixels_agent_pos")
+        assert set(features) - {camera.key for camera in CAMERAS.values()} == set(MEANINGS)
+
+
+def test_the_card_counts_what_there_is(card, data):
+    rows = data.rows
+    assert f"{rows['episode_index'].nunique()} scripted demonstrations ({len(rows)} frames" in card
+    assert "10 attempts, 9 succeeded (90.0 %)" in card and "Discarded: seeds 1000002." in card
+    assert f"frame rate: {FPS} Hz" in card and "Every eighth is held out: 7." in card
+    for phase, count in rows["phase"].value_counts().items():
+        assert f"| {phase} | {count} |" in card
+    low, high = np.quantile(data.column("action")[:, 0], [0.01, 0.99])
+    found = re.search(r"dx (-?[\d.]+) to (-?[\d.]+)", card)
+    np.testing.assert_allclose([float(found[1]), float(found[2])], [low, high], atol=1e-3)
+
+
+def test_every_column_of_the_data_set_is_on_the_card(card, data):
+    named = set(re.findall(r"^\| `([\w.]+)` \|", card, re.MULTILINE))
+    bookkeeping = {"timestamp", "frame_index", "episode_index", "index", "task_index"}
+    assert named == set(data.info["features"]) - bookkeeping
+
+
+def test_the_front_matter_is_yaml_for_the_hub(card):
+    front = yaml.safe_load(card.split("---")[1])
+    assert front["license"] == "apache-2.0" and "LeRobot" in front["tags"]
+
+
+def test_the_training_commands_are_ones_that_lerobot_takes(card):
+    commands = re.findall(r"^lerobot-train (?:.*\\\n)*.*$", card, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        flags = dict(flag.split("=", 1) for flag in shlex.split(command.replace("\\\n", " "))[1:])
+        assert flags["--dataset.repo_id"] == "local/toy"
+        mapped = json.loads(flags.get("--rename_map", "{}"))
+        assert set(mapped) <= {camera.key for camera in CAMERAS.values()}
+        assert ("--policy.path" in flags) == bool(mapped)
+
+
+@pytest.mark.parametrize("obs_type", ["pixels", "pixels_agent_pos"])
+@pytest.mark.parametrize("task", TASKS)
+def test_the_modality_covers_every_channel_once(task, obs_type):
+    parts = modality(TASKS[task], obs_type)
+    for kind, length in (("state", 8), ("action", len(TASKS[task].action_names))):
+        spans = [(part["start"], part["end"]) for part in parts[kind].values()]
+        assert [index for start, end in spans for index in range(start, end)] == list(range(length))
+    features = demonstration_features(TASKS[task], obs_type)
+    assert {video["original_key"] for video in parts["video"].values()} == {n for n in features if "images" in n}
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_card_with_its_pictures(copy, tmp_path):
+    command = [sys.executable, "-m", "lerobot_constructskill.scripts.card", f"--root={copy}", "--repo_id=alice/toy"]
+    done = subprocess.run([*command, f"--facts={tmp_path / 'facts.json'}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    card = (copy / "README.md").read_text()
+    assert card.startswith("---\n") and "# alice/toy" in card
+    assert card == render(json.loads((tmp_path / "facts.json").read_text()))
+    for name in re.findall(r"\((pictures/\w+\.png)\)", card):
+        assert np.asarray(Image.open(copy / name)).std() > 10
+
+
+@pytest.mark.parametrize(
+    "folder", sorted(path.parent for path in CARDS.glob("*/README.md")), ids=lambda path: path.name
+)
+def test_a_kept_card_is_what_its_facts_render_to(folder):
+    facts = json.loads((folder / "facts.json").read_text())
+    card = (folder / "README.md").read_text()
+    assert card == render(facts)
+    assert all((folder / name).is_file() for name in re.findall(r"\((pictures/\w+\.png)\)", card))
+    generated = CARDS.parent / "outputs" / folder.name / "demonstrations"
+    if generated.is_dir():
+        assert card_facts(open_dataset(generated)) | {"repo_id": facts["repo_id"]} == facts

@@ -1,0 +1,140 @@
+"""Rollouts in lockstep are `lerobot-eval`'s, step for step, and a policy that fails takes none down with it."""
+
+import numpy as np
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.scripts.lerobot_eval import rollout
+
+from lerobot_constructskill.contract import GRIPPER_CLOSED
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+from lerobot_constructskill.policies.frozen_vit.precision import native_precision
+from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.lockstep import Episode, roll_out
+from lerobot_constructskill.rollout.simulators import Step
+
+pytestmark = [pytest.mark.sim]
+
+STEPS, SEEDS = 7, [1000, 1001]
+ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial state depends on the seed
+
+
+def random_agent(config, seed, **fields):
+    torch.manual_seed(seed)
+    filled = config(**fields)
+    filled.input_features = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+    policy = FrozenViTChunkPolicy(filled)
+    return PolicyAgent(policy, *make_pre_post_processors(policy.config))
+
+
+@pytest.fixture(scope="module")
+def vector():
+    (vector,) = ConstructSkillEnvConfig(**ENV).create_envs(n_envs=1)["constructskill"].values()
+    yield vector
+    vector.close()
+
+
+def lerobots_actions(agent, vector, seed):
+    """What `lerobot-eval` does with one environment, as (steps, A)."""
+    same = [lambda batch: batch] * 2
+    agent.policy.reset()
+    ran = rollout(vector, agent.policy, *same, agent.preprocessor, agent.postprocessor, seeds=[seed])
+    return ran["action"][0].numpy()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"backbone_precision": "bfloat16"},
+        {"backbone_precision": "float32"},
+        {"temporal_ensemble_coeff": None, "n_action_steps": 4},
+        {"readout": "spatial_softmax"},
+    ],
+    ids=str,
+)
+def test_lockstep_equals_lerobot_eval_step_for_step(fields, config, vector):
+    if fields.get("backbone_precision") == "bfloat16":
+        pytest.importorskip("openvino", reason="autocast's features depend on the batch")
+        if native_precision("cpu") != "bfloat16":
+            pytest.skip("this CPU only emulates bfloat16")
+    agents = [random_agent(config, seed, **fields) for seed in range(2)]
+    seen = {}
+    keep = lambda i, episode, action, _: seen.setdefault((i, episode), []).append(action)  # noqa: E731
+    outcomes = dict(roll_out(agents, ENV, SEEDS, on_step=keep))
+    assert all(len(outcome.episodes) == 2 and outcome.error is None for outcome in outcomes.values())
+    assert len({id(agent.policy.backbone) for agent in agents}) == 1
+    for (i, episode), actions in seen.items():
+        np.testing.assert_array_equal(actions, lerobots_actions(agents[i], vector, SEEDS[episode]))
+    assert not np.array_equal(seen[0, 0], seen[1, 0]) and not np.array_equal(seen[0, 0], seen[0, 1])
+
+
+class Broken:
+    """Fails at its third step, or acts in a way that the environment refuses."""
+
+    def __init__(self, action):
+        self.action = action
+        self.n = 0
+
+    def reset(self, seed):
+        self.n = 0
+
+    def act(self, observation):
+        self.n += 1
+        if self.action is None and self.n == 3:
+            raise ValueError("lost the plot")
+        return np.zeros(4, dtype=np.float32) if self.action is None else self.action
+
+
+def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on(config, monkeypatch):
+    unready, sightless, sharing = (random_agent(config, seed) for seed in range(3))
+
+    def no_beginning(seed):
+        raise RuntimeError("no beginning")
+
+    def no_image(observation):
+        raise KeyError("wrist")
+
+    monkeypatch.setattr(unready, "reset", no_beginning)
+    monkeypatch.setattr(sightless, "preprocessor", no_image)
+    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    found = (rollout for _, rollout in sorted(roll_out([unready, hover, sightless, sharing], ENV, SEEDS, n_workers=2)))
+    not_begun, fine, unseen, seen = found
+    assert "no beginning" in str(not_begun.error) and isinstance(unseen.error, KeyError)
+    assert all(rollout.error is None and len(rollout.episodes) == len(SEEDS) for rollout in (fine, seen))
+
+
+def test_an_encoder_that_fails_takes_those_with_it_that_share_it_and_no_other(config, monkeypatch):
+    agents = [random_agent(config, seed) for seed in range(2)]
+
+    def out_of_memory(*_):
+        raise MemoryError("no room for the batch")
+
+    monkeypatch.setattr(FrozenViTChunkPolicy, "pool", out_of_memory)
+    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    *failed, fine = (rollout for _, rollout in sorted(roll_out([*agents, hover], ENV, SEEDS, n_workers=2)))
+    assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2 and fine.error is None
+
+
+def test_a_failing_agent_is_recorded_and_the_others_go_on():
+    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    agents = [Broken(None), hover, Broken(np.full(4, np.nan, dtype=np.float32))]
+    failed, fine, refused = (outcome for _, outcome in sorted(roll_out(agents, ENV, SEEDS, n_workers=2)))
+    assert "lost the plot" in str(failed.error) and failed.episodes == []
+    assert "finite" in str(refused.error) and refused.episodes == []
+    assert fine.error is None
+    assert [(e.evaluation_seed, e.steps, e.stage) for e in fine.episodes] == [(s, STEPS, "none") for s in SEEDS]
+
+
+def step(**info):
+    state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
+    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False} | info)
+
+
+def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
+    episode = Episode(1000)
+    for info in ({}, {"is_lifted": True}, {"is_lifted": True, "is_in_bin": True}, {"is_lifted": True}):
+        episode.add(step(**info))
+    assert (episode.stage, episode.lift_step, episode.place_step, episode.steps) == ("in_bin", 2, None, 4)
+    assert episode.final_error_m == 5.0 and episode.lifted and not episode.placed

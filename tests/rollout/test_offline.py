@@ -1,0 +1,137 @@
+"""The offline evaluator: what it says of policies whose errors are known, and of real checkpoints."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from lerobot.policies.factory import make_pre_post_processors
+
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.rollout.offline import Predictions, offline_metrics, predict
+from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
+
+EPISODES, CHUNK = [3, 7], 5
+SHIFT = np.array([0.001, -0.002, 0.002, 0], dtype=np.float32)
+"""Metres; 3 mm long."""
+
+
+class Oracle:
+    """A policy that recognises the frame and repeats its labels, `shift` added."""
+
+    name = "oracle"
+
+    def __init__(self, dataset, shift=SHIFT * 0):
+        rows = dataset.hf_dataset.with_format("torch")
+        self.seen, self.actions = rows["observation.features.base"][:], rows["action"][:]
+        self.shift = torch.from_numpy(shift)
+
+    def reset(self):
+        pass
+
+    def predict_action_chunk(self, batch):
+        frames = torch.cdist(batch["observation.features.base"], self.seen).argmin(1)
+        steps = (frames[:, None] + torch.arange(CHUNK)).clamp(max=len(self.actions) - 1)
+        return self.actions[steps] + self.shift
+
+
+class WithoutChunks(Oracle):
+    def predict_action_chunk(self, batch):
+        raise NotImplementedError
+
+    def select_action(self, batch):
+        return super().predict_action_chunk(batch)[:, 0]
+
+
+def as_it_is(batch):
+    return batch
+
+
+def measure(policy, dataset):
+    return offline_metrics(predict(policy, as_it_is, as_it_is, dataset, EPISODES, batch_size=7))
+
+
+def test_a_policy_that_repeats_the_labels_has_no_error(feature_set):
+    metrics = measure(Oracle(feature_set), feature_set)
+    assert metrics.frames == sum(feature_set.meta.episodes["length"][i] for i in EPISODES)
+    assert metrics.rmse_m == metrics.mean_m == metrics.consistency_m == 0
+    assert metrics.gripper_accuracy == metrics.gripper_change_accuracy == 1
+    assert metrics.rmse_rotation_rad is None
+
+
+def test_a_constant_shift_is_found_in_metres(feature_set):
+    metrics = measure(Oracle(feature_set, SHIFT), feature_set)
+    found = [metrics.rmse_dx_m, metrics.rmse_dy_m, metrics.rmse_dz_m]
+    np.testing.assert_allclose(found, np.abs(SHIFT[:3]), atol=1e-6)
+    assert metrics.rmse_m == pytest.approx(0.003, abs=1e-6) and metrics.mean_m == pytest.approx(0.003, abs=1e-6)
+    assert metrics.consistency_m == pytest.approx(0, abs=1e-6)
+
+
+def test_a_policy_without_chunks_has_no_consistency(feature_set):
+    metrics, chunked = (measure(kind(feature_set, SHIFT), feature_set) for kind in (WithoutChunks, Oracle))
+    assert metrics.consistency_m is None
+    assert asdict(metrics) == asdict(chunked) | {"consistency_m": None}
+
+
+def demonstration(length=40, changes=(10, 30), dims=4):
+    """Labels (T, A) of a gripper that closes and opens again."""
+    labels = np.random.default_rng(0).normal(scale=0.02, size=(length, dims)).astype(np.float32)
+    labels[:, -1] = 1
+    labels[slice(*changes), -1] = -1
+    return labels
+
+
+def test_a_gripper_that_never_moves_gets_half_of_the_changes():
+    labels = demonstration()
+    still = labels.copy()
+    still[:, -1] = 1
+    metrics = offline_metrics([Predictions(labels, still[:, None])])
+    assert (metrics.gripper_accuracy, metrics.gripper_change_accuracy) == (0.5, 0.5)
+
+
+def test_chunks_that_drift_disagree_by_their_drift_and_beyond_the_end_nothing_counts():
+    labels = demonstration()
+    drift = np.arange(CHUNK)[:, None] * SHIFT
+    steps = np.arange(len(labels))[:, None] + np.arange(CHUNK)
+    chunks = labels[steps.clip(max=len(labels) - 1)] + drift
+    chunks[steps >= len(labels)] = 99
+    metrics = offline_metrics([Predictions(labels, chunks)])
+    assert metrics.consistency_m == pytest.approx(0.003, abs=1e-6) and metrics.rmse_m == 0
+
+
+def test_rotation_is_apart_from_translation():
+    labels = demonstration(dims=5)
+    turned = labels.copy()
+    turned[:, 3] += 0.1
+    metrics = offline_metrics([Predictions(labels, turned[:, None])])
+    assert metrics.rmse_m == 0 and metrics.rmse_rotation_rad == pytest.approx(0.1, abs=1e-6)
+
+
+def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_set, tmp_path):
+    """Of chunks of one step the error is that which training found on the same held-out episodes."""
+    trained = train_seeds(config(chunk_size=1), feature_set, [0, 1], epochs=3, batch_size=16, held_out=EPISODES)
+    for policy, seed in zip(trained, [0, 1], strict=True):
+        save_checkpoint(policy, feature_set, tmp_path / f"seed_{seed}" / "pretrained_model")
+    found = f"{tmp_path}/seed_*/pretrained_model"
+    asked = OfflineConfig([found], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
+    printed = evaluate_offline(asked)
+    rows, table = json.loads((tmp_path / "offline.json").read_text()), pd.read_parquet(tmp_path / "offline.parquet")
+    assert "n/a" in printed and [row["policy"] for row in rows] == ["frozen_vit"] * 2
+    assert list(table["training_seed"]) == [0, 1]
+    assert list(table["rmse_m"]) == [row["rmse_m"] for row in rows]
+    preprocess, _ = make_pre_post_processors(trained[0].config, dataset_stats=feature_set.meta.stats)
+    errors = heldout_mse(trained, feature_set, EPISODES, preprocess)
+    for row, error in zip(rows, errors, strict=True):
+        assert row["rmse_m"] ** 2 / 3 == pytest.approx(error, rel=1e-4)
+    assert rows[0]["weights_sha256"] != rows[1]["weights_sha256"]
+    assert rows[0]["dataset_sha256"] == rows[1]["dataset_sha256"] and rows[0]["episodes"] == "3,7"
+
+
+def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
+    with pytest.raises(FileNotFoundError, match="matches no checkpoint"):
+        evaluate_offline(OfflineConfig([str(tmp_path / "none")], "local/random", feature_set.root))
+    (tmp_path / "config.json").touch()
+    with pytest.raises(ValueError, match="among the 8 there are"):
+        evaluate_offline(OfflineConfig([str(tmp_path)], "local/random", feature_set.root, episodes=[8]))

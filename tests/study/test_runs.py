@@ -1,0 +1,258 @@
+"""What a study's runs depend on, and what they do not: found without running any of them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.analysis.section import Analysis
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.execute import EPISODES
+from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
+from lerobot_constructskill.study.run import choose, run_study
+from lerobot_constructskill.study.runs import list_runs
+from lerobot_constructskill.study.spec import Options, Setting, Study, Training, Variant
+from lerobot_constructskill.study.table import Table, status
+
+ACT = {"type": "act", "pretrained_backbone_weights": None}
+"""A policy that needs no weights from anywhere."""
+
+
+def study(**fields) -> Study:
+    given = {
+        "name": "x",
+        "settings": {"fixed": Setting("smoke", {"episode_length": 8})},
+        "variants": {"a": Variant(ACT, seeds=3), "b": Variant(ACT | {"dim_model": 64}, seeds=2)},
+        "references": {"no_op": 1, "replay": 1},
+        "episodes": 2,
+    }
+    return Study(**given | fields)
+
+
+def digests(of: Study) -> dict[str, str]:
+    return {run.id: run.artifact.digest for run in list_runs(of)}
+
+
+def changed(before: Study, after: Study) -> set[str]:
+    """The runs of `after` that those of `before` do not hold."""
+    there = set(digests(before).values())
+    return {name for name, digest in digests(after).items() if digest not in there}
+
+
+def make_all(of: Study, root: Path) -> Table:
+    """Every run is there already; the last was made first."""
+    store = Store(root / "store")
+    for run in reversed(list_runs(of)):
+        with store.claim([run.artifact]) as missing:
+            for artifact in missing:
+                with store.writing(artifact) as folder:
+                    folder.mkdir()
+                    row = EpisodeRow(run=artifact.digest, training_seed=run.seed, evaluation_seed=1000, episode=0)
+                    write_rows([row], folder / EPISODES, EpisodeRow)
+    return run_study(of, "", root / of.name, store, Options())
+
+
+def test_thirty_seeds_after_ten_are_twenty_runs():
+    ten, thirty = (study(variants={"a": Variant(ACT, seeds=seeds)}) for seeds in (10, 30))
+    assert changed(ten, thirty) == {f"fixed/a/seed_{seed}" for seed in range(10, 30)}
+
+
+def test_names_labels_and_how_a_study_is_run_change_no_run():
+    before = study()
+    renamed = study(
+        name="y", settings={"s": before.settings["fixed"]}, variants={"c": before.variants["a"]}, references={}
+    )
+    assert not changed(before, renamed)
+    fields = {name: getattr(before, name) for name in ("name", "settings", "variants", "references", "episodes")}
+    analysis = {"labels": {"a": "ACT"}, "order": ["b"], "comparisons": [["a", "b"]], "alpha": 0.01}
+    other = StudyConfig(**fields, analysis=Analysis(**analysis), workers=7, together=3, store=Path("elsewhere"))
+    assert other.study == before and not changed(before, other.study)
+    elsewhere = {"device": "cpu", "push_to_hub": True, "tags": ["x"]}
+    assert not changed(before, study(variants={"a": Variant(ACT | elsewhere, seeds=3)}))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"episodes": 3},
+        {"eval_seed": 7},
+        {"settings": {"fixed": Setting("smoke", {"episode_length": 9})}},
+        {"settings": {"fixed": Setting("smoke", {"episode_length": 8, "perturb": "light=1"})}},
+    ],
+    ids=str,
+)
+def test_another_evaluation_is_another_run_of_the_same_checkpoint(fields):
+    before, after = list_runs(study()), list_runs(study(**fields))
+    assert not {run.artifact.digest for run in before} & {run.artifact.digest for run in after}
+    for one, other in zip(before, after, strict=True):
+        assert (one.checkpoint and one.checkpoint.digest) == (other.checkpoint and other.checkpoint.digest)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"training": Training(epochs=7)},
+        {"variants": {"a": Variant(ACT | {"dim_model": 128}, seeds=1)}},
+        {"variants": {"a": Variant(ACT, seeds=1, training={"batch_size": 8})}},
+        {"variants": {"a": Variant(ACT, seeds=1, data="fast")}},
+    ],
+    ids=str,
+)
+def test_another_policy_recipe_or_data_set_is_another_run(fields):
+    assert "fixed/a/seed_0" in changed(study(), study(**fields))
+
+
+def test_an_edited_generator_file_runs_exactly_what_depends_on_it(tmp_path):
+    paths = [tmp_path / "one.yaml", tmp_path / "two.yaml"]
+    for path in paths:
+        path.write_text("task: brick_to_bin\nepisodes: 2\n")
+    settings = {path.stem: Setting(str(path), {"episode_length": 8}) for path in paths}
+    of = study(settings=settings, variants={"a": Variant(ACT, seeds=1)}, references={"no_op": 1, "replay": 1})
+    before = digests(of)
+    paths[0].write_text("task: brick_to_bin\nepisodes: 2\nnoise: {sigma: 0.02}\n# and a comment\n")
+    after = digests(of)
+    assert {name for name in after if after[name] != before[name]} == {"one/a/seed_0", "one/replay/seed_0"}
+
+
+def test_a_moved_generator_file_runs_nothing(tmp_path):
+    """Nor do defaults that are spelt out, or comments."""
+    first, moved = tmp_path / "here.yaml", tmp_path / "there" / "moved.yaml"
+    first.write_text("task: brick_to_bin\nepisodes: 2\n")
+    moved.parent.mkdir()
+    moved.write_text("# moved\nepisodes: 2\ntask: brick_to_bin\nnoise: {sigma: 0.01}\nlabels: clean\n")
+    one, other = (study(settings={"fixed": Setting(str(path), {"episode_length": 8})}) for path in (first, moved))
+    assert not changed(one, other)
+
+
+def test_another_version_of_a_package_is_another_run(monkeypatch):
+    from lerobot_constructskill.study import runs
+
+    before = study()
+    there = set(digests(before).values())
+    real = runs.versions
+    monkeypatch.setattr(runs, "versions", lambda *names: real(*names) | {"torch": "99.0"})
+    assert not there & set(digests(before).values())
+
+
+def test_two_studies_share_the_runs_that_they_share(tmp_path):
+    first = make_all(study(), tmp_path)
+    second = study(name="y", variants={"same": Variant(ACT, seeds=4)}, references={})
+    table = Table(tmp_path / "y", list_runs(second), first.store)
+    assert [run.id for run in table.missing()] == ["fixed/same/seed_3"]
+
+
+def test_a_whole_study_runs_nothing_and_its_table_is_in_the_studys_order(tmp_path):
+    of = study(
+        settings={name: Setting("smoke", {"episode_length": length}) for name, length in (("second", 8), ("first", 9))}
+    )
+    table = make_all(of, tmp_path)  # nothing to run: neither data nor weights exist here
+    rows = read_rows(tmp_path / "x" / "rows.parquet")
+    found = [*zip(rows["setting"], rows["variant"], rows["training_seed"], strict=True)]
+    assert found == [(run.arm.setting, run.arm.name, run.seed) for run in table.runs]
+    assert {path.name for path in table.store.root.iterdir()} == {"runs", "locks"}
+
+
+def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
+    table = Table(tmp_path, list_runs(study()), Store(tmp_path / "store"))
+    table.write()
+    rows = read_rows(tmp_path / "rows.parquet")
+    assert set(rows["error_kind"]) == {NOT_RUN} and len(rows) == 7 and set(rows["episodes"]) == {2}
+    assert "fixed/a: 0 finished, 0 failed, 3 missing" in status(table).splitlines()
+
+
+def test_runs_that_are_something_else_are_one_sentence(tmp_path):
+    table = make_all(study(), tmp_path)
+    folder = table.store.folder(table.runs[-1].artifact)
+    (folder / EPISODES).unlink()
+    with pytest.raises(InputError, match="has no episodes"):
+        make_all(study(), tmp_path)
+    (folder / EPISODES).write_text("no parquet")
+    with pytest.raises(InputError, match="cannot be read"):
+        make_all(study(), tmp_path)
+    (folder / "spec.json").unlink()
+    with pytest.raises(InputError, match="move it away"):
+        make_all(study(), tmp_path)
+
+
+def test_some_runs_are_chosen_by_their_names():
+    runs = list_runs(study())
+    assert [run.id for run in choose(runs, "*/seed_1, fixed/no_op")] == [
+        "fixed/no_op/seed_0",
+        "fixed/a/seed_1",
+        "fixed/b/seed_1",
+    ]
+    assert len(choose(runs, "")) == len(choose(runs, "fixed")) == len(runs)
+    assert len(choose(list_runs(study(variants={"a": Variant(ACT, 12)})), "fixed/a/seed_1")) == 1
+    with pytest.raises(InputError, match="fits no run"):
+        choose(runs, "other/*")
+
+
+def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp_path, tiny_weights):
+    tiny = {"type": "frozen_vit", "backbone": "vit_tiny16", "backbone_path": str(tiny_weights)}
+    of = study(
+        variants={"act": Variant(ACT, 1), "tiny": Variant(tiny, 1, training={"epochs": 2})},
+        references={"blind": 1, "untrained": 1},
+    )
+    blind, untrained, _, seeing = list_runs(of)
+    assert blind.arm.policy == replace(seeing.arm.policy, blind=True)
+    assert blind.arm.training == untrained.arm.training == Training(epochs=2)
+    assert not untrained.arm.policy.backbone_pretrained and seeing.arm.policy.backbone_pretrained
+    with pytest.raises(InputError, match="'blind' needs a variant whose policy has blind"):
+        list_runs(study(references={"blind": 1}))
+
+
+@pytest.mark.parametrize(
+    "fields, said",
+    [
+        ({"variants": {}}, "at least one of variants"),
+        ({"variants": {"a b": Variant(ACT)}}, "'a b' is no name"),
+        ({"variants": {"no_op": Variant(ACT)}}, "name of two things"),
+        ({"variants": {"a": Variant({})}}, "must name its policy's type"),
+        ({"variants": {"a": Variant({"type": "pi9"})}}, "variants.a.policy: .*pi9"),
+        ({"variants": {"a": Variant(ACT | {"chunk_sise": 5})}}, "variants.a.policy: .*chunk_sise"),
+        (
+            {"variants": {"a": Variant(ACT | {"chunk_size": 5})}},
+            "variants.a.policy: The chunk size is",
+        ),
+        ({"variants": {"a": Variant({"type": "frozen_vit", "chunk_size": 0})}}, "variants.a.policy: chunk_size"),
+        ({"variants": {"a": Variant(ACT, training={"epoch": 5})}}, "variants.a.training: .*epoch"),
+        ({"variants": {"a": Variant(ACT, training={"epochs": -2})}}, "variants.a.training: .*epochs must be at least"),
+        ({"variants": {"a": Variant(ACT, settings=["moved"])}}, "Unknown setting 'moved' of variant 'a'"),
+        ({"variants": {"a": Variant(ACT, data="fasst")}}, "no file and no generate configuration 'fasst'"),
+        ({"references": {"oracle": 1}}, "Unknown reference 'oracle'; there are: no_op"),
+        ({"references": {"random": 0}}, "references.random must be at least 1"),
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"eval_seed": -1}, "eval_seed must be a number from 0"),
+        ({"settings": {"fixed": Setting("smoke", {"task": "brick"})}}, "settings.fixed.env: Unknown task 'brick'"),
+        ({"settings": {"fixed": Setting("smoke", {"foo": 1})}}, "settings.fixed.env: .*foo"),
+        ({"settings": {"fixed": Setting("smoke", {"episode_length": -5})}}, "settings.fixed.env: episode_length"),
+        ({"settings": {"fixed": Setting("smoke", {"task": "bins"})}}, "settings.fixed.env: .*bins"),
+    ],
+    ids=str,
+)
+def test_a_study_that_cannot_be_run_is_refused_in_one_sentence_before_anything_runs(fields, said):
+    with pytest.raises(UserError, match=said) as refused:
+        list_runs(study(**fields))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("recipe", [{"epochs": -2}, {"batch_size": 0}, {"holdout": 1}], ids=str)
+def test_a_recipe_that_trains_nothing_is_refused(recipe):
+    with pytest.raises(InputError, match=f"training.{next(iter(recipe))} must be at least"):
+        Training(**recipe)
+
+
+@pytest.mark.parametrize("how", [{"executor": "slurm"}, {"together": 0}, {"workers": 0}], ids=str)
+def test_a_way_to_run_that_there_is_not_is_refused(how):
+    with pytest.raises(InputError, match=next(iter(how))):
+        Options(**how)
+
+
+def test_a_cut_study_is_made_of_the_same_runs():
+    whole = StudyConfig(**{name: getattr(study(), name) for name in ("name", "settings", "variants", "references")})
+    cut = replace(whole, seeds=2).study
+    assert {name: variant.seeds for name, variant in cut.variants.items()} == {"a": 2, "b": 2}
+    assert not changed(whole.study, cut)
