@@ -228,7 +228,7 @@ def get_task(name: str) -> Task:
         ValueError: there is no such task; the message lists those there are.
     """
     if name not in TASKS:
-        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {', '.join(SUITES)}.")
+        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}.")
     return TASKS[name]
 
 
@@ -255,6 +255,9 @@ def select_tasks(names: str) -> dict[str, list[Task]]:
     selected: dict[str, list[Task]] = {}
     for name in (part.strip() for part in names.split(",")):
         suite, members = (name, SUITES[name]) if name in SUITES else (LOOSE, (name,))
+        if suite == LOOSE and name not in TASKS:
+            suites = ", ".join(SUITES)
+            raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {suites}.")
         selected.setdefault(suite, []).extend(get_task(member) for member in members)
     rows = [row for suite in selected.values() for row in suite]
     if len(set(rows)) < len(rows):

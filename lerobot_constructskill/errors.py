@@ -4,7 +4,13 @@ A `UserError` is a sentence that says what is wrong with a request, a file or a 
 other exception that leaves the package is a defect of it, or an `OSError` of the operating system.
 """
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, requires
 from traceback import TracebackException
+
+DISTRIBUTION = "lerobot_env_constructskill"
 
 
 class UserError(Exception):
@@ -16,6 +22,13 @@ class UserError(Exception):
 
 class InputError(UserError, ValueError):
     """A value, a file or a combination of them that cannot be used."""
+
+
+class FieldError(UserError):
+    """An `InputError` of a configuration that LeRobot's commands parse.
+
+    No ValueError: draccus says "Couldn't instantiate class" in place of those, and hands on what others say.
+    """
 
 
 class MissingError(UserError, FileNotFoundError):
@@ -40,6 +53,29 @@ class MachineError(UserError, OSError):
     """This machine, its network or the Hub does not do its part."""
 
     kind = "machine"
+
+
+def remedy_of(error: ModuleNotFoundError) -> str | None:
+    """How to install a package that one of our extras brings; None for any other package."""
+    wanted = (error.name or "").partition(".")[0]
+    try:
+        requirements = requires(DISTRIBUTION) or []
+    except PackageNotFoundError:
+        requirements = []
+    for requirement in requirements:
+        package, extra = re.match(r"[\w.-]+", requirement)[0], re.search(r"extra == [\"']([\w-]+)", requirement)
+        if extra and package.replace("-", "_") == wanted:
+            return f"{wanted} is not installed; pip install '{DISTRIBUTION}[{extra[1]}]'."
+    return None
+
+
+@contextmanager
+def heard_by_lerobot() -> Iterator[None]:
+    """Make the block's `InputError` one that LeRobot's commands end in."""
+    try:
+        yield
+    except InputError as error:
+        raise FieldError(str(error)) from None
 
 
 def kind_of(error: BaseException) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import draccus
 from draccus.argparsing import ArgumentParser
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import FieldError, InputError
 
 OURS = Path(__file__).parent
 
@@ -47,12 +47,16 @@ def as_input() -> Iterator[None]:
         yield
     except (OSError, InputError):
         raise
+    except FieldError as error:
+        raise InputError(str(error)) from None
     except (TypeError, AttributeError):  # draccus merges fields, and copies them, before it looks at them
         raise InputError("The configuration's file is empty or not a mapping of fields.") from None
     except Exception as error:  # those of draccus, argparse and YAML have no base in common
         root = error
         while root.__cause__ is not None:
             root = root.__cause__
+        if isinstance(root, FieldError):
+            raise InputError(str(root)) from None
         refusals = [frame for frame in traceback.extract_tb(root.__traceback__) if frame.name == "__post_init__"]
         if refusals and Path(refusals[-1].filename).is_relative_to(OURS):
             raise root from None  # a configuration of ours, which refuses the values or is broken itself

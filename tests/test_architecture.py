@@ -13,10 +13,11 @@ PACKAGE = "lerobot_constructskill"
 ROOT = Path(__file__).parents[1] / PACKAGE
 SIMULATOR = {"sapien", "mani_skill", "mplib"}
 
-# What a room, or a file with a row of its own, may import of ours, a room or a file of one; its own room and these two
-# go without saying.
-EVERYWHERE = ("errors", "progress")
+# What a room, or a file with a row of its own, may import of ours, a room or a file of one; its own room and
+# these three go without saying.
+EVERYWHERE = ("bounds", "errors", "progress")
 ARROWS = {
+    "bounds": (),
     "errors": (),
     "progress": (),
     "parsing": (),
@@ -70,6 +71,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 
 # Files that name every package they may import.
 EXTERNALS = {
+    "bounds": {"torch"},
     "errors": set(),
     "progress": {"av", "tqdm"},
     "contract": set(),

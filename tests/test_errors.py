@@ -9,7 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, full_traceback
+from lerobot_constructskill.errors import (
+    FieldError,
+    InputError,
+    MachineError,
+    MissingError,
+    TakenError,
+    UserError,
+    full_traceback,
+    heard_by_lerobot,
+    remedy_of,
+)
 
 REPOSITORY = Path(__file__).parents[1]
 MODULES = sorted((REPOSITORY / "lerobot_constructskill").rglob("*.py"))
@@ -68,6 +78,12 @@ def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) ->
     [
         ("OSError(28, 'No space left on device')", 1, "[Errno 28] No space left on device"),
         ("ModuleNotFoundError('No module named x', name='x')", 1, "No module named x; constructskill-doctor tells"),
+        ("ModuleNotFoundError('No module named sapien', name='sapien')", 1, "sapien is not installed; pip install '"),
+        (
+            "ModuleNotFoundError('No module named jinja2', name='jinja2')",
+            1,
+            "jinja2 is not installed; pip install '",
+        ),
         ("KeyboardInterrupt", 130, "interrupted"),
     ],
 )
@@ -91,7 +107,7 @@ def test_what_is_raised_for_the_user_is_told_from_what_python_raises(module: Pat
     assert not raised & PYTHONS, "raise a class of errors.py, or RuntimeError where only a defect leads"
 
 
-@pytest.mark.parametrize("kind", [InputError, MissingError, TakenError, MachineError])
+@pytest.mark.parametrize("kind", [InputError, FieldError, MissingError, TakenError, MachineError])
 def test_a_sentence_survives_the_way_between_processes(kind: type[UserError]) -> None:
     error = pickle.loads(pickle.dumps(kind("a sentence.")))
     assert type(error) is kind and str(error) == "a sentence."
@@ -117,3 +133,29 @@ def test_a_traceback_comes_home_from_a_simulators_process() -> None:
     error = pickle.loads(pickle.dumps(_attempt("reset", Broken(), 7)))
     assert type(error) is KeyError and error.args == (7,)
     assert "in reset\n    raise KeyError(seed)" in full_traceback(error)
+
+
+def test_a_missing_package_is_named_with_its_extra() -> None:
+    for package, extra in ("mani_skill", "sim"), ("matplotlib", "study"), ("openvino", "cpu"), ("ray", "distributed"):
+        remedy = remedy_of(ModuleNotFoundError(name=f"{package}.inner"))
+        assert remedy == f"{package} is not installed; pip install 'lerobot_env_constructskill[{extra}]'."
+    assert remedy_of(ModuleNotFoundError(name="elsewhere")) is None
+
+
+WITHOUT_SIMULATOR = """
+import sys
+sys.modules["mani_skill"] = None
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+ConstructSkillEnv().reset(seed=0)
+"""
+
+
+def test_an_environment_without_its_simulator_says_what_to_install() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_SIMULATOR], capture_output=True, text=True)
+    assert "pip install 'lerobot_env_constructskill[sim]'." in done.stderr.splitlines()[-1]
+
+
+def test_what_lerobot_parses_is_refused_by_no_value_error() -> None:
+    with pytest.raises(FieldError, match="a sentence") as refusal, heard_by_lerobot():
+        raise InputError("a sentence.")
+    assert not isinstance(refusal.value, ValueError)

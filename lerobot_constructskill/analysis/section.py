@@ -3,8 +3,12 @@
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from itertools import chain
+from typing import Annotated
 
+from lerobot_constructskill.bounds import Range, check
 from lerobot_constructskill.errors import InputError
+
+Level = Annotated[float, Range(above=0, most=0.5)]
 
 
 @dataclass(frozen=True)
@@ -25,11 +29,10 @@ class Analysis:
     labels: dict[str, str] = field(default_factory=dict)
     order: list[str] = field(default_factory=list)
     comparisons: list[list[str]] | None = None
-    alpha: float = 0.05
+    alpha: Level = 0.05
 
     def __post_init__(self):
-        if not 0 < self.alpha < 1:
-            raise InputError(f"alpha must lie between 0 and 1, not {self.alpha}.")
+        check(self, "analysis.")
         for pair in self.comparisons or []:
             if len(pair) != 2 or pair[0] == pair[1]:
                 raise InputError(f"A comparison is a pair of variants, not {pair}.")

@@ -3,10 +3,11 @@
 import ctypes
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 
 from lerobot_constructskill.errors import InputError, MachineError
@@ -62,9 +63,9 @@ def _processes(workers: int) -> Iterator[Submit]:
         raise MachineError(DIED) from None
 
 
-def die_with_parent() -> None:
-    """Have the kernel kill this process when the one that started it ends, however that ends (Linux alone)."""
-    with suppress(OSError, AttributeError):
+def be_killed_with_parent() -> None:
+    """Have the kernel kill this process when the one that forked it ends, however that ends (Linux alone)."""
+    if sys.platform == "linux":
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
@@ -73,10 +74,15 @@ def _settle() -> None:
     for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    die_with_parent()
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
+    """End this worker process when its parent has ended, whatever either of them is busy with."""
+    threading.Thread(target=_outlive_no_parent, daemon=True).start()
+
+
+def _outlive_no_parent() -> None:
     parent_process().join()
     os._exit(1)
 

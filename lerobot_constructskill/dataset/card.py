@@ -1,14 +1,17 @@
 """A data set's card: its README.md on the Hub, rendered from the data and the contract table."""
 
-from importlib.resources import files
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
+from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_values
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task, held_out
+from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
-from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.columns import SIDECAR, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
+
+Version = Annotated[str, Pattern(r"[\w.+!-]{1,64}", "a version")]
 
 MEANINGS = {
     "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",
@@ -30,8 +33,22 @@ MEANINGS = {
 }
 
 
+class Provenance:
+    """What a card quotes of `meta/constructskill.json`, beside the configuration."""
+
+    attempts: Count
+    discarded_seeds: list[Seed]
+    versions: dict[Word, Version]
+    noise_covariance: list[list[float]]
+
+
 def card_facts(data: DataSet) -> dict[str, Any]:
-    """The facts of a card: plain values, so that they can be kept beside it and compared with the data later."""
+    """The facts of a card: plain values, so that they can be kept beside it and compared with the data later.
+
+    Raises:
+        InputError: the data set says of itself what none can.
+    """
+    check_values(Provenance, data.facts, f"{SIDECAR}: ")
     lengths = [span.stop - span.start for span in data.spans()]
     phases, noise = data.column("phase"), data.column("dart.noise")
     base = data.column("sim.tcp_pose")[0, :3] - data.column("observation.state")[0, :3]
@@ -64,15 +81,12 @@ def card_facts(data: DataSet) -> dict[str, Any]:
 
 def render(facts: dict[str, Any]) -> str:
     """The card of a data set with these facts, in Markdown with the Hub's front matter."""
-    from jinja2 import Environment, StrictUndefined
-
     task = get_task(facts["generator"]["task"])
     features = demonstration_features(task, facts["generator"]["obs_type"])
     cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
-    template = files(__package__).joinpath("card.md.j2").read_text()
-    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
-    return environment.from_string(template).render(
+    return markdown.render(
+        "card.md.j2",
         **facts,
         task=task,
         fps=FPS,

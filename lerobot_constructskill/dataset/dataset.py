@@ -100,22 +100,34 @@ def open_dataset(root: Path) -> DataSet:
     """
     check_is_there(root)
     tasks = _tables(root, "meta/tasks.parquet").reset_index()
+    if "task_index" not in tasks:
+        raise InputError("meta/tasks.parquet has no column task_index.")
     data = DataSet(
         root=root,
-        info=_json(root, "meta/info.json"),
-        stats=_json(root, "meta/stats.json"),
-        facts=_json(root, SIDECAR),
+        info=read_facts(root, "meta/info.json"),
+        stats=read_facts(root, "meta/stats.json"),
+        facts=read_provenance(root),
         rows=_tables(root, "data/*/*.parquet"),
         episodes=_tables(root, "meta/episodes/*/*.parquet"),
         tasks=tasks.sort_values("task_index").iloc[:, 0].tolist(),
     )
     if data.rows.empty:
         raise InputError("data/ holds no frames.")
+    _check_features(data.info["features"])
     of_videos = [f"videos/{camera}/{name}" for camera in data.cameras for name in VIDEO_COLUMNS]
     missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
     if missing:
         raise InputError(f"meta/episodes/ has no column {missing[0]}.")
     return data
+
+
+def _check_features(features: Any) -> None:
+    described = isinstance(features, Facts) and all(isinstance(feature, Facts) for feature in features.values())
+    if not described:
+        raise InputError("features in meta/info.json must hold an object for every column.")
+    for feature in features.values():
+        if not isinstance(feature["dtype"], str) or not isinstance(feature["shape"], list):
+            raise InputError("features in meta/info.json must give every column a dtype and a shape.")
 
 
 def check_is_there(root: Path) -> None:
@@ -128,11 +140,34 @@ def check_is_there(root: Path) -> None:
         raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
 
 
-def _json(root: Path, name: str) -> Facts:
+def read_provenance(root: Path) -> Facts:
+    """How a data set was made.
+
+    Raises:
+        MissingError: nothing says so.
+        InputError: the file cannot be read.
+    """
+    if not (root / SIDECAR).is_file():
+        raise MissingError(
+            f"{root} has no {SIDECAR}, which says how it was made: only constructskill-generate writes it, and "
+            "lerobot-edit-dataset drops it when it deletes, splits or merges."
+        )
+    return read_facts(root, SIDECAR)
+
+
+def read_facts(root: Path, name: str) -> Facts:
+    """The JSON object in a file of a folder.
+
+    Raises:
+        InputError: the file cannot be read, or holds something else.
+    """
     try:
-        return json.loads((root / name).read_text(), object_hook=partial(Facts, name))
+        facts = json.loads((root / name).read_text(), object_hook=partial(Facts, name))
     except (OSError, ValueError) as error:
         raise InputError(f"{name} cannot be read ({error}).") from None
+    if not isinstance(facts, Facts):
+        raise InputError(f"{name} must hold a JSON object, not {type(facts).__name__}.")
+    return facts
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:

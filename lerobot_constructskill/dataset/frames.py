@@ -34,20 +34,34 @@ def check_videos(data: DataSet) -> Iterator[str]:
             yield from _check_packets(path, expected, path.relative_to(data.root))
 
 
-def _check_packets(path: Path, expected: int, name: Path) -> Iterator[str]:
+def packet_times(path: Path, name: Path) -> list[float]:
+    """Time stamps of a video's frames in seconds, without decoding.
+
+    Args:
+        name: what to call it.
+
+    Raises:
+        InputError: it is missing or cannot be read.
+    """
     import av
 
     if not path.is_file():
-        yield f"{name} is missing."
-        return
+        raise InputError(f"{name} is missing.")
     try:
         with av.open(str(path)) as video:
             stream = video.streams.video[0]
-            times = sorted(
+            return sorted(
                 float(packet.pts * stream.time_base) for packet in video.demux(stream) if packet.pts is not None
             )
     except (av.FFmpegError, IndexError) as error:
-        yield f"{name} cannot be read ({error})."
+        raise InputError(f"{name} cannot be read ({error}).") from None
+
+
+def _check_packets(path: Path, expected: int, name: Path) -> Iterator[str]:
+    try:
+        times = packet_times(path, name)
+    except InputError as error:
+        yield str(error)
         return
     if len(times) != expected:
         yield f"{name} has {len(times)} frames, the rows of its episodes are {expected}."

@@ -5,10 +5,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError
+from lerobot_constructskill.dataset.frames import packet_times
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
+
+PUSHED = [
+    "README.md",
+    "pictures/contact_sheet.png",
+    "pictures/trajectories.png",
+    "meta/*.json",
+    "meta/*.parquet",
+    "data/*.parquet",
+    "videos/*.mp4",
+]
+"""What leaves the machine; `*` stands for folders as well."""
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
@@ -65,9 +77,26 @@ def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -
         check_is_there(root)
     try:
         with one_sentence(repo_id, revision):
-            return LeRobotDataset(repo_id, root=root, revision=revision)
-    except (ValueError, LookupError) as error:
-        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({error}).") from error
+            dataset = LeRobotDataset(repo_id, root=root, revision=revision)
+    except (UserError, OSError):
+        raise
+    except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
+        said = f"{type(error).__name__}: {error}"
+        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({said}).") from error
+    _check_videos(dataset)
+    return dataset
+
+
+def _check_videos(dataset: "LeRobotDataset") -> None:
+    """Refuse videos that are not whole now, before an hour of work has come to them."""
+    rows: dict[Path, int] = {}
+    for episode in dataset.meta.episodes:
+        for camera in dataset.meta.video_keys:
+            path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], camera)
+            rows[path] = rows.get(path, 0) + episode["length"]
+    for path, wanted in rows.items():
+        if (found := len(packet_times(path, path.relative_to(dataset.root)))) < wanted:
+            raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, its episodes have {wanted}.")
 
 
 @contextmanager
@@ -141,7 +170,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         if CODEBASE_VERSION in tagged and not update:
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
-        commit = api.upload_folder(**repo, folder_path=root, ignore_patterns=[".cache/*"], delete_patterns=stale)
+        commit = api.upload_folder(**repo, folder_path=root, allow_patterns=PUSHED, delete_patterns=stale)
         for name in filter(None, (CODEBASE_VERSION, tag)):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)

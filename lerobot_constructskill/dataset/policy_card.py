@@ -1,12 +1,12 @@
 """What a policy's card says beyond LeRobot's: outcomes per training seed, the data set's revision, the backbone."""
 
-import json
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
-from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.dataset import markdown
+from lerobot_constructskill.dataset.dataset import read_facts
+from lerobot_constructskill.errors import InputError, MissingError
 
 
 def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
@@ -17,10 +17,14 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     """
     outcomes = []
     for path in folder.glob("seed_*/eval_info.json"):
-        tasks = json.loads(path.read_text())["per_task"]
-        stages = [stage for task in tasks for stage in task["metrics"]["max_rewards"]]
+        tasks = read_facts(folder, str(path.relative_to(folder)))["per_task"]
+        try:
+            stages = [stage for task in tasks for stage in task["metrics"]["max_rewards"]]
+            seed = int(path.parent.name.removeprefix("seed_"))
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path} is not what lerobot-eval writes ({error}).") from None
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
-        outcomes.append((int(path.parent.name.removeprefix("seed_")), lifted, placed, len(stages)))
+        outcomes.append((seed, lifted, placed, len(stages)))
     if not outcomes:
         raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
     return sorted(outcomes)
@@ -30,12 +34,9 @@ def render_outcomes(
     outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
 ) -> str:
     """The section, in Markdown, from `train_config.json` and the policy's `config.json`."""
-    from jinja2 import Environment, StrictUndefined
-
     backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256", "precision")}
-    template = files(__package__).joinpath("policy_card.md.j2").read_text()
-    environment = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, autoescape=False)
-    return environment.from_string(template).render(
+    return markdown.render(
+        "policy_card.md.j2",
         outcomes=outcomes,
         task=task,
         this_seed=train["seed"],

@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib import import_module
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 
+from lerobot_constructskill.bounds import Range, Steps, check
 from lerobot_constructskill.contract import Task
-from lerobot_constructskill.errors import InputError
 
 
 class Phase(StrEnum):
@@ -64,6 +64,12 @@ class Progress:
         return replace(self, steps=self.steps + 1)
 
 
+Gain = Annotated[float, Range(above=0, most=100)]
+Step = Annotated[float, Range(above=0, most=1, unit="m")]
+Compliance = Annotated[float, Range(0, 1, unit="m/N")]
+Height = Annotated[float, Range(-1, 1, unit="m")]
+
+
 @dataclass(frozen=True)
 class ExpertConfig:
     """Gains, thresholds and dwells of a scripted expert.
@@ -87,26 +93,21 @@ class ExpertConfig:
         ValueError: a value that no demonstration can be made with.
     """
 
-    gain: float = 1.0
-    max_step: float = 0.012
-    load_max_step: float = 0.035
-    compliance: float = 0.001
-    threshold: float = 0.02
-    align_tolerance: float = 0.006
-    grasp_dwell: int = 10
-    release_dwell: int = 20
-    pregrasp_clearance: float = 0.15
-    lift_height: float = 0.40
-    release_clearance: float = 0.04
-    finger_depth: float = 0.03
+    gain: Gain = 1.0
+    max_step: Step = 0.012
+    load_max_step: Step = 0.035
+    compliance: Compliance = 0.001
+    threshold: Step = 0.02
+    align_tolerance: Step = 0.006
+    grasp_dwell: Steps = 10
+    release_dwell: Steps = 20
+    pregrasp_clearance: Height = 0.15
+    lift_height: Height = 0.40
+    release_clearance: Height = 0.04
+    finger_depth: Height = 0.03
 
     def __post_init__(self):
-        for name in ("gain", "max_step", "load_max_step", "threshold", "align_tolerance"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise InputError(f"The expert's {name} must be above 0, not {getattr(self, name)}.")
-        for name in ("grasp_dwell", "release_dwell"):
-            if getattr(self, name) < 1:
-                raise InputError(f"The expert's {name} must be at least 1 step, not {getattr(self, name)}.")
+        check(self, "expert.")
 
 
 class Expert(Protocol):

@@ -1,14 +1,20 @@
 """Noise on the executed action (Laskey et al. 2017): Gaussian, of a covariance that is fixed or was fitted."""
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
+from lerobot_constructskill.bounds import Among, Range, check
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
 MODELS = ("fixed", "isotropic", "dart")
 FITTED = ("isotropic", "dart")
+
+Sigma = Annotated[float, Range(0, 1, unit="m")]
+PhaseName = Annotated[str, Among(tuple(Phase))]
+Clip = Annotated[float, Range(above=0, most=1, unit="m")]
 
 
 @dataclass(frozen=True)
@@ -28,23 +34,15 @@ class NoiseConfig:
         ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or is none.
     """
 
-    model: str = "fixed"
-    sigma: float = 0.01
+    model: Annotated[str, Among(MODELS)] = "fixed"
+    sigma: Sigma = 0.01
     covariance: list[list[float]] | None = None
     fitted_on: dict[str, str] | None = None
-    clip: float = 0.08
-    phases: list[str] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
+    clip: Clip = 0.08
+    phases: list[PhaseName] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
 
     def __post_init__(self):
-        if self.model not in MODELS:
-            raise InputError(f"Unknown noise model '{self.model}'; choose one of: {', '.join(MODELS)}.")
-        if not 0 <= self.sigma < np.inf:
-            raise InputError(f"Noise sigma must be 0 or more metres, not {self.sigma}.")
-        if not self.clip > 0:
-            raise InputError(f"Noise clip must be above 0 metres, not {self.clip}.")
-        unknown = [phase for phase in self.phases if phase not in list(Phase)]
-        if unknown:
-            raise InputError(f"Unknown phase {unknown[0]!r}; the phases are: {', '.join(Phase)}.")
+        check(self, "noise.")
         if self.model in FITTED and self.covariance is None:
             raise InputError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
         if self.covariance is not None:
@@ -64,7 +62,7 @@ class NoiseConfig:
 
 def _check_covariance(covariance: list[list[float]]) -> None:
     matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, atol=1e-12):
+    if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
         raise InputError(f"A noise covariance is a symmetric 3 x 3 matrix in m2, not {covariance}.")
     if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
         raise InputError(f"The noise covariance {covariance} has a negative variance.")

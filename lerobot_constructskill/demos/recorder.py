@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.disk import disk_of, room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.contract import OBS_TYPES
@@ -60,7 +61,7 @@ def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
     """Write the data set to a path that `staged` gave, by way of shards beside it. Raises as `record` does."""
     shards = folder.with_name(SHARDS) / frames_digest(config)
     attempts = _run_attempts(config, shards)
-    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
+    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet(), room_for(folder):
         merge(config, attempts, shards, folder)
     return attempts
 
@@ -106,7 +107,7 @@ def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
     longest = config.episodes * config.max_steps
     needed = 2 * BYTES_PER_IMAGE * longest * len(OBS_TYPES[config.obs_type])
-    disk = next(folder for folder in root.absolute().parents if folder.exists())
+    disk = disk_of(root.parent)
     free = shutil.disk_usage(disk).free
     if free < needed:
         raise MachineError(

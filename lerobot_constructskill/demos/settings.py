@@ -1,16 +1,18 @@
 """What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
+from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
-from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed")
+
+Share = Annotated[float, Range(0, 10_000)]
 
 FRAME_PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
@@ -39,32 +41,27 @@ class GenerateConfig:
             on a file system that all its machines share).
 
     Raises:
-        ValueError: unknown task, obs_type, labels or executor, or a count below 1.
+        ValueError: a field holds what its annotation does not allow, or there is no such task.
     """
 
-    repo_id: str
-    root: str | None = None
+    repo_id: RepoId
+    root: Text | None = None
     task: str = "brick_to_bin"
-    episodes: int = 80
-    obs_type: str = "pixels"
-    max_steps: int = 1000
-    max_failures: float = 1.0
-    seed_start: int = DEMO_SEED_START
+    episodes: Count = 80
+    obs_type: Annotated[str, Among(tuple(OBS_TYPES))] = "pixels"
+    max_steps: Steps = 1000
+    max_failures: Share = 1.0
+    seed_start: Seed = DEMO_SEED_START
     light_robot: bool | None = None
-    labels: str = "clean"
+    labels: Annotated[str, Among(LABELS)] = "clean"
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    workers: int = 1
-    executor: str = "processes"
+    workers: Workers = 1
+    executor: Annotated[str, Among(EXECUTORS)] = "processes"
 
     def __post_init__(self):
+        check(self)
         get_task(self.task)
-        for name, choices in (("obs_type", OBS_TYPES), ("labels", LABELS), ("executor", EXECUTORS)):
-            if getattr(self, name) not in choices:
-                raise InputError(f"Unknown {name} '{getattr(self, name)}'; choose one of: {', '.join(choices)}.")
-        for name in ("episodes", "max_steps", "workers"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}.")
 
 
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:

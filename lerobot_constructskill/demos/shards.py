@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import demonstration_features
@@ -51,9 +53,10 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     outcome = Attempt(seed, success, len(frames), light_robot)
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
-        if success:
-            _write_episode(config, [frame | {"task": task.instruction} for frame in frames], shard / EPISODE)
-        (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
+        with room_for(shard):
+            if success:
+                _write_episode(config, [frame | {"task": task.instruction} for frame in frames], shard / EPISODE)
+            (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
     return outcome
 
 
@@ -65,8 +68,17 @@ def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | N
 
 def finished(folder: Path) -> dict[int, Attempt]:
     """The attempts whose shards lie in `folder`, by seed."""
-    outcomes = [Attempt(**json.loads(path.read_text())) for path in folder.glob(f"*/{OUTCOME}")]
-    return {outcome.seed: outcome for outcome in outcomes}
+    outcomes = [_read(path) for path in sorted(folder.glob(f"*/{OUTCOME}"))]
+    return {outcome.seed: outcome for outcome in outcomes if outcome}
+
+
+def _read(path: Path) -> Attempt | None:
+    """A finished attempt; None where a power cut left a file without its content, and its shard is then removed."""
+    try:
+        return Attempt(**json.loads(path.read_text()))
+    except (ValueError, TypeError):
+        shutil.rmtree(path.parent)
+        return None
 
 
 def _write_episode(config: GenerateConfig, frames: list[dict], root: Path) -> None:

@@ -3,17 +3,18 @@
 import multiprocessing
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
-from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, ObsType, RenderBackend
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
@@ -41,28 +42,18 @@ class ConstructSkillEnvConfig(EnvConfig):
     """
 
     task: str = "brick_to_bin"
-    fps: int = FPS
-    obs_type: str = "pixels"
-    episode_length: int | None = None
+    fps: Annotated[int, Range(FPS, FPS, unit="Hz, the control rate of every task")] = FPS
+    obs_type: ObsType = "pixels"
+    episode_length: Steps | None = None
     light_robot: bool | None = None
-    render_backend: str = "auto"
-    vectorization: str = "process"
+    render_backend: RenderBackend = "auto"
+    vectorization: Annotated[str, Among(VECTORIZATIONS)] = "process"
     perturb: str = ""
-    perturb_seed: int = 0
+    perturb_seed: Seed = 0
 
     def __post_init__(self):
-        if self.max_parallel_tasks != 1:
-            raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
-        if self.fps != FPS:
-            raise InputError(f"fps must be {FPS}, the control rate of every task, not {self.fps}.")
-        if self.vectorization not in VECTORIZATIONS:
-            choices = " or ".join(VECTORIZATIONS)
-            raise InputError(f"vectorization must be {choices}, not '{self.vectorization}'.")
-        if self.vectorization == "native" and self.perturb:
-            raise InputError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
-        rows = [row for suite in select_tasks(self.task).values() for row in suite]
-        for row in rows:
-            self._make_env(row.name)  # refuses what no environment can be made with
+        with heard_by_lerobot():
+            rows = self._check()
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),))}
         self.features_map = {"action": "action"}
         for name in OBS_TYPES[self.obs_type]:
@@ -72,6 +63,18 @@ class ConstructSkillEnvConfig(EnvConfig):
         if self.obs_type == "pixels_agent_pos":
             self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
             self.features_map["agent_pos"] = "observation.state"
+
+    def _check(self) -> list[Task]:
+        """Return the tasks."""
+        check(self)
+        if self.max_parallel_tasks != 1:
+            raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+        if self.vectorization == "native" and self.perturb:
+            raise InputError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
+        rows = [row for suite in select_tasks(self.task).values() for row in suite]
+        for row in rows:
+            self._make_env(row.name)  # refuses what no environment can be made with
+        return rows
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

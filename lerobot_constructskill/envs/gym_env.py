@@ -1,11 +1,12 @@
 """One environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     FPS,
@@ -20,7 +21,7 @@ from lerobot_constructskill.contract import (
     TRANSLATION,
     get_task,
 )
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.perturbations import Perturbation
 
 CHANNEL_SCALE = {
@@ -34,7 +35,8 @@ replay bit for bit."""
 MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
 
-RENDER_BACKENDS = ("auto", "gpu", "cpu", "none")
+ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
+RenderBackend = Annotated[str, Among(("auto", "gpu", "cpu", "none"))]
 
 
 class ConstructSkillEnv(gym.Env):
@@ -69,23 +71,16 @@ class ConstructSkillEnv(gym.Env):
     def __init__(
         self,
         task: str = "brick_to_bin",
-        obs_type: str = "pixels",
-        episode_length: int | None = None,
+        obs_type: ObsType = "pixels",
+        episode_length: Steps | None = None,
         light_robot: bool | None = None,
-        render_backend: str = "auto",
+        render_backend: RenderBackend = "auto",
         perturb: str = "",
-        perturb_seed: int = 0,
+        perturb_seed: Seed = 0,
     ):
+        check_values(ConstructSkillEnv.__init__, locals())
         self._perturbation = Perturbation(perturb, perturb_seed)
         self._row = get_task(task)
-        if obs_type not in OBS_TYPES:
-            raise InputError(f"Unknown obs_type '{obs_type}'; choose one of: {', '.join(OBS_TYPES)}.")
-        if render_backend not in RENDER_BACKENDS:
-            raise InputError(
-                f"Unknown render_backend '{render_backend}'; choose one of: {', '.join(RENDER_BACKENDS)}."
-            )
-        if episode_length is not None and episode_length < 1:
-            raise InputError(f"episode_length must be at least 1 step, not {episode_length}.")
         self.task = task
         self.task_description = self._row.instruction
         self.obs_type = obs_type
@@ -180,7 +175,10 @@ class ConstructSkillEnv(gym.Env):
 
     def make_scene(self, num_envs: int = 1) -> gym.Env:
         """The task's ManiSkill environment; several copies of it in one simulator need a GPU."""
-        import lerobot_constructskill.sim.register  # noqa: F401
+        try:
+            import lerobot_constructskill.sim.register  # noqa: F401
+        except ModuleNotFoundError as error:  # Gymnasium's worker processes drop the name of the package
+            raise MachineError(remedy_of(error) or str(error)) from error
 
         return gym.make(
             self._row.env_id,

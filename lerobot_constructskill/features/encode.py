@@ -16,6 +16,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from torch import Tensor
 
 from lerobot_constructskill.artifacts.digests import data_sha256, digest
+from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
@@ -84,10 +85,11 @@ def write_feature_set(
     info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
     made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
-    features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
-    _write_copy(dataset, camera, features, info, repo_id, folder)
-    if patches:
-        _join_patches(dataset, parts, encoder.spec, folder / PATCHES_FILE)
+    with room_for(folder):
+        features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
+        _write_copy(dataset, camera, features, info, repo_id, folder)
+        if patches:
+            _join_patches(dataset, parts, encoder.spec, folder / PATCHES_FILE)
 
 
 def _encode_frames(

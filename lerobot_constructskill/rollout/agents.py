@@ -14,6 +14,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 
+from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import as_input
 
 
@@ -70,10 +71,16 @@ class PolicyAgent:
             config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
         config.device = device or config.device
         config.pretrained_path = checkpoint
-        with redirect_stdout(StringIO()):  # LeRobot prints where it loads weights from, for every policy
-            policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
         on_device = {"device_processor": {"device": config.device}}
-        processors = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=on_device)
+        try:
+            with redirect_stdout(StringIO()):  # LeRobot prints where it loads weights from, for every policy
+                policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+            processors = make_pre_post_processors(config, str(checkpoint), preprocessor_overrides=on_device)
+        except (UserError, OSError, ImportError):
+            raise
+        except Exception as error:  # whatever a file can do to LeRobot, safetensors and a policy of anybody's
+            said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+            raise InputError(f"The checkpoint '{checkpoint}' cannot be loaded ({said}).") from error
         return cls(policy, *processors)
 
     def reset(self, seed: int) -> None:

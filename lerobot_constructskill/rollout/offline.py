@@ -13,9 +13,11 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
 from torch.utils.data import DataLoader, Subset
 
-from lerobot_constructskill.contract import TRANSLATION
+from lerobot_constructskill.contract import GRIPPER, TRANSLATION
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
 
@@ -101,6 +103,26 @@ def _disagreements(chunks: np.ndarray) -> np.ndarray:
     distances = np.linalg.norm(earlier.astype(np.float64) - later, axis=-1)
     steps = np.arange(1, length)[:, None] + np.arange(size - 1)
     return distances[steps < length]
+
+
+def check_actions(policy: PreTrainedPolicy, dataset: LeRobotDataset) -> None:
+    """Refuse a policy whose actions are not those of the demonstrations, or demonstrations in other units than ours.
+
+    Raises:
+        InputError: their names or their number differ; most policies know no names.
+    """
+    names = dataset.meta.features[ACTION]["names"]
+    if not isinstance(names, list) or tuple(names[:3]) != TRANSLATION or names[-1] != GRIPPER:
+        wanted = ", ".join((*TRANSLATION, "any rotations", GRIPPER))
+        raise InputError(f"'{dataset.repo_id}' must have the actions {wanted}, not {names}.")
+    acts_in = getattr(policy.config, "action_names", None)
+    if acts_in not in (None, names):
+        raise InputError(f"The policy acts in {acts_in}, but the actions of '{dataset.repo_id}' are {names}.")
+    feature = policy.config.output_features.get(ACTION)
+    if feature and feature.shape[0] != len(names):
+        raise InputError(
+            f"The policy's actions have {feature.shape[0]} numbers, those of '{dataset.repo_id}' have {len(names)}."
+        )
 
 
 def predict(

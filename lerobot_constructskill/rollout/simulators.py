@@ -10,11 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.artifacts.pools import cores
+from lerobot_constructskill.artifacts.pools import cores, die_with_parent
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError, full_traceback
 
-PRELOADED = ["lerobot_constructskill.sim.register", "lerobot_constructskill.rollout.simulators"]
+PRELOADED = [
+    "lerobot_constructskill.artifacts.mortal",
+    "lerobot_constructskill.sim.register",
+    "lerobot_constructskill.rollout.simulators",
+]
 """Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
 
 
@@ -96,6 +100,7 @@ def _receive(worker: Connection) -> dict[int, Any]:
 
 def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:
     """Serve environments until the other side hangs up."""
+    die_with_parent()
     _use_one_thread()
     envs: dict[int, ConstructSkillEnv] = {}
     while True:

@@ -4,6 +4,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.bounds import RepoId, check
 from lerobot_constructskill.scripts.console import run
 
 
@@ -12,9 +13,12 @@ class CardConfig:
     """Write README.md, pictures/contact_sheet.png and pictures/trajectories.png for a data set."""
 
     root: Path  # the data set's folder
-    repo_id: str | None = None  # its name on the Hub; the one it was generated under when left out
+    repo_id: RepoId | None = None  # its name on the Hub; the one it was generated under when left out
     out: Path | None = None  # where to write; into root when left out
     facts: Path | None = None  # also write the card's facts as JSON here
+
+    def __post_init__(self):
+        check(self)
 
 
 def write_card(config: CardConfig) -> str:
@@ -24,6 +28,7 @@ def write_card(config: CardConfig) -> str:
         FileNotFoundError: there is no data set in `root`.
         ValueError: a file that cannot be read.
     """
+    from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.dataset.card import card_facts, render
     from lerobot_constructskill.dataset.dataset import open_dataset
     from lerobot_constructskill.dataset.plots import contact_sheet, trajectories
@@ -32,9 +37,11 @@ def write_card(config: CardConfig) -> str:
     facts = card_facts(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
     contact_sheet(data, out / "pictures" / "contact_sheet.png")
     trajectories(data, out / "pictures" / "trajectories.png")
-    (out / "README.md").write_text(render(facts))
+    with replaced(out / "README.md") as partial:
+        partial.write_text(render(facts))
     if config.facts:
-        config.facts.write_text(json.dumps(facts, indent=2) + "\n")
+        with replaced(config.facts) as partial:
+            partial.write_text(json.dumps(facts, indent=2) + "\n")
     return f"Card and pictures written to {out}"
 
 

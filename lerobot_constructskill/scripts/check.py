@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.bounds import RepoId, Text, check
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
@@ -11,12 +12,15 @@ from lerobot_constructskill.scripts.console import run
 class CheckConfig:
     """Check a data set of demonstrations; exit status 1 where something is wrong."""
 
-    repo_id: str | None = None  # its name; pulled from the Hub unless root is given
+    repo_id: RepoId | None = None  # its name; pulled from the Hub unless root is given
     root: Path | None = None  # its folder
-    revision: str | None = None  # tag, branch or commit on the Hub
+    revision: Text | None = None  # tag, branch or commit on the Hub
+
+    def __post_init__(self):
+        check(self)
 
 
-def check(config: CheckConfig) -> str:
+def check_dataset(config: CheckConfig) -> str:
     """Print a line for each check and return the verdict.
 
     Raises:
@@ -41,7 +45,7 @@ def check(config: CheckConfig) -> str:
 
 
 def main() -> None:
-    run(CheckConfig, check)
+    run(CheckConfig, check_dataset)
 
 
 if __name__ == "__main__":

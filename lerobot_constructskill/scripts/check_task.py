@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot_constructskill.bounds import Count, check
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -27,19 +28,18 @@ class CheckTaskConfig:
     """
 
     task: str
-    states: int = 100  # random initial states, without rendering
+    states: Count = 100  # random initial states, without rendering
     noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     folder: Path = Path("outputs/check")  # where the contact sheet goes
     tests: bool = True  # run the registry tests of this task; needs a checkout
 
     def __post_init__(self):
+        check(self)
         get_task(self.task)
-        if self.states < 1:
-            raise InputError(f"states must be at least 1, not {self.states}.")
 
 
-def check(config: CheckTaskConfig) -> str:
+def check_task(config: CheckTaskConfig) -> str:
     from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
     from lerobot_constructskill.analysis.stats.outcomes import Counts
 
@@ -113,7 +113,7 @@ def run_tests(task: str) -> int:
 
 
 def main() -> None:
-    run(CheckTaskConfig, check)
+    run(CheckTaskConfig, check_task)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
-from lerobot_constructskill.errors import InputError, UserError, full_traceback
+from lerobot_constructskill.errors import InputError, UserError, full_traceback, remedy_of
 from lerobot_constructskill.presets import find, names
 
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
@@ -85,7 +85,7 @@ def _judge(error: BaseException) -> tuple[int, str]:
     if isinstance(error, UserError | OSError):
         return REFUSED, said
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lerobot_constructskill"):
-        return REFUSED, f"{said}; constructskill-doctor tells what is not installed"
+        return REFUSED, remedy_of(error) or f"{said}; constructskill-doctor tells what is not installed"
     return FAULT, f"this is a fault of ours, not of your input: {type(error).__name__}: {said}"
 
 

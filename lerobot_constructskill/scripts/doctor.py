@@ -7,10 +7,9 @@ import sys
 from collections.abc import Callable, Iterable
 from importlib import metadata
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import DISTRIBUTION, InputError
 from lerobot_constructskill.scripts.console import EPILOG, edge
 from lerobot_constructskill.scripts.doctor_checks import (
-    DISTRIBUTION,
     Finding,
     Level,
     Probe,

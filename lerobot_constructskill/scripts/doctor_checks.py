@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-DISTRIBUTION = "lerobot_env_constructskill"
+from lerobot_constructskill.errors import DISTRIBUTION
+
 PYTHONS = ((3, 12), (3, 13))
 """Those that `make setup` takes, for which every pinned package has a wheel."""
 MESA_MINIMUM = (24, 3)

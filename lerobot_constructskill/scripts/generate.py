@@ -1,11 +1,18 @@
 """`constructskill-generate`: scripted demonstrations into a LeRobotDataset."""
 
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.errors import remedy_of
 from lerobot_constructskill.scripts.console import run
 
 
 def generate(config: GenerateConfig) -> str:
+    from lerobot_constructskill.scripts.card import CardConfig, write_card
+
     summary = record(config)
+    try:
+        print(write_card(CardConfig(summary.root)), flush=True)
+    except ModuleNotFoundError as error:  # the demonstrations are whole; constructskill-card writes it later
+        print(f"No card: {remedy_of(error) or error}", flush=True)
     return (
         f"{summary.episodes} demonstrations, {summary.frames} frames, {len(summary.discarded_seeds)} attempts "
         f"discarded: {summary.root}"

@@ -1,32 +1,39 @@
 """`constructskill-offline`: what any LeRobot policies predict on held-out demonstrations, a row a checkpoint."""
 
 import json
-import re
 from dataclasses import asdict, dataclass
 from glob import glob
 from pathlib import Path
+from typing import Annotated
 
 from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.bounds import BatchSize, Device, Episode, NotEmpty, RepoId, Seed, Text, check
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.console import run
+
+Patterns = Annotated[list[Text], NotEmpty()]
+Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass
 class OfflineConfig:
     """Print and write a table of translation errors in metres, gripper accuracy and chunk consistency."""
 
-    policies: list[str]  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
-    repo_id: str  # the demonstrations
+    policies: Patterns  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
+    repo_id: RepoId  # the demonstrations
     root: Path | None = None  # their folder; LeRobot's cache, or the Hub, when left out
-    revision: str | None = None  # tag, branch or commit on the Hub
-    episodes: list[int] | None = None  # held-out demonstrations; every eighth when left out
+    revision: Text | None = None  # tag, branch or commit on the Hub
+    episodes: Episodes | None = None  # held-out demonstrations; every eighth when left out
     out: Path = Path("outputs/offline")  # folder for offline.json and offline.parquet
-    batch_size: int = 32  # frames at a time
-    seed: int = 0  # of policies that sample their actions
-    device: str | None = None  # default: that of the checkpoint
-    backbone_precision: str | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+    batch_size: BatchSize = 32  # frames at a time
+    seed: Seed = 0  # of policies that sample their actions
+    device: Device | None = None  # default: that of the checkpoint
+    backbone_precision: Text | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+
+    def __post_init__(self):
+        check(self)
 
 
 SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
@@ -86,9 +93,10 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.rollout.agents import PolicyAgent
-    from lerobot_constructskill.rollout.offline import observed, offline_metrics, predict
+    from lerobot_constructskill.rollout.offline import check_actions, observed, offline_metrics, predict
 
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
+    check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
@@ -104,12 +112,11 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 
 def _training_seed(checkpoint: Path) -> int | None:
-    """As `lerobot-train` keeps it, or as a study names the checkpoint's folder."""
-    path = checkpoint / "train_config.json"
-    if path.is_file():
-        return json.loads(path.read_text()).get("seed")
-    named = re.fullmatch(r"seed_(\d+)", checkpoint.absolute().parent.name)
-    return int(named[1]) if named else None
+    """As `lerobot-train` keeps it, or a study."""
+    for path in (checkpoint / "train_config.json", checkpoint / "spec.json"):
+        if path.is_file():
+            return json.loads(path.read_text()).get("seed")
+    return None
 
 
 def _write(rows: list[dict], folder: Path) -> str:

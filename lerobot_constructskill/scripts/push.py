@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.bounds import RepoId, Word, check
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
@@ -14,11 +15,14 @@ class PushConfig:
     Interrupted, the same command continues.
     """
 
-    repo_id: str  # its name on the Hub, user/name
+    repo_id: RepoId  # its name on the Hub, user/name
     root: Path  # its folder
     private: bool = False  # whether only its owner sees it
-    tag: str | None = None  # a version of its own, beside LeRobot's tag
+    tag: Word | None = None  # a version of its own, beside LeRobot's tag
     update: bool = False  # replace a data set that is there already
+
+    def __post_init__(self):
+        check(self)
 
 
 def push_dataset(config: PushConfig) -> str:

@@ -1,9 +1,9 @@
 """`constructskill-push-policy`: a trained policy onto the Hub by LeRobot's own push, its outcomes on the card."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.bounds import RepoId, check
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.scripts.console import run
@@ -15,11 +15,12 @@ class PushPolicyConfig:
 
     policy_path: Path  # a checkpoint's `pretrained_model` folder
     evaluations: Path  # folder of seed_*/eval_info.json, as lerobot-eval writes them
-    repo_id: str  # its name on the Hub, user/name
+    repo_id: RepoId  # its name on the Hub, user/name
     task: str  # what it was evaluated in, as `--env.task`
     private: bool = False  # whether only its owner sees it
 
     def __post_init__(self):
+        check(self)
         get_task(self.task)
 
 
@@ -41,9 +42,11 @@ def push_policy(config: PushPolicyConfig) -> str:
 
 
 def _read(path: Path) -> dict:
+    from lerobot_constructskill.dataset.dataset import read_facts
+
     if not path.is_file():
         raise MissingError(f"{path} is missing: name a checkpoint's pretrained_model folder.")
-    return json.loads(path.read_text())
+    return read_facts(path.parent, path.name)
 
 
 def _push(config: PushPolicyConfig, section: str) -> None:

@@ -2,19 +2,26 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+from lerobot_constructskill.bounds import Episode, NotEmpty, RepoId, Text, check
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
+
+Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass
 class ReplayConfig:
     """Replay a data set in the simulator; exit status 1 where an outcome differs."""
 
-    repo_id: str | None = None  # its name; pulled from the Hub unless root is given
+    repo_id: RepoId | None = None  # its name; pulled from the Hub unless root is given
     root: Path | None = None  # its folder
-    revision: str | None = None  # tag, branch or commit on the Hub
-    episodes: list[int] | None = None  # which to replay; all when left out
+    revision: Text | None = None  # tag, branch or commit on the Hub
+    episodes: Episodes | None = None  # which to replay; all when left out
+
+    def __post_init__(self):
+        check(self)
 
 
 def replay_all(config: ReplayConfig) -> str:

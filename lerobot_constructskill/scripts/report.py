@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_constructskill.bounds import check
 from lerobot_constructskill.scripts.console import run
 
 
@@ -15,6 +16,9 @@ class ReportConfig:
     """
 
     root: Path
+
+    def __post_init__(self):
+        check(self)
 
 
 def report(config: ReportConfig) -> Path:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from lerobot_constructskill.analysis.section import Analysis
+from lerobot_constructskill.bounds import Count
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.study.spec import Options, Study
@@ -24,14 +25,12 @@ class StudyConfig(Options, Study):
     analysis: Analysis = field(default_factory=Analysis)
     root: Path | None = None
     store: Path = Path("outputs/store")
-    seeds: int | None = None
+    seeds: Count | None = None
     status: bool = False
 
     def __post_init__(self):
+        super().__post_init__()
         Study.__post_init__(self)
-        Options.__post_init__(self)
-        if self.seeds is not None and self.seeds < 1:
-            raise InputError(f"seeds must be at least 1, not {self.seeds}.")
         self.analysis.check(self.variants, [*self.settings, *self.references])
 
     @property

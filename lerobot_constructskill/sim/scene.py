@@ -141,6 +141,11 @@ class PickPlaceEnv(BaseEnv):
             self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
+        elif render_backend == "gpu" and best_render_backend() != "gpu":
+            raise MachineError(
+                "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
+                "`constructskill-doctor` tells what is missing."
+            )
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot

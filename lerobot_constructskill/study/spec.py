@@ -1,16 +1,16 @@
 """A study as a file: what is trained on what, with which seeds, and where it is evaluated."""
 
-import math
 import re
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
+from lerobot_constructskill.bounds import Among, BatchSize, Count, Pattern, Range, Seed, Workers, check, check_values
 from lerobot_constructskill.contract import HELD_OUT_EVERY
 from lerobot_constructskill.errors import InputError
 
-NAME = re.compile(r"[a-z0-9][a-z0-9_-]*")
-"""What settings and variants are called: they name videos and stand in every row."""
+NAME = r"[a-z0-9][a-z0-9_-]*"
+"""What studies, settings and variants are called: they name folders and videos, and stand in every row."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Variant:
     """
 
     policy: dict[str, Any]
-    seeds: int = 10
+    seeds: Count = 10
     data: str | None = None
     settings: list[str] | None = None
     training: dict[str, Any] = field(default_factory=dict)
@@ -58,13 +58,12 @@ class Training:
         ValueError: a number that nothing can be trained with.
     """
 
-    epochs: int = 150
-    batch_size: int = 256
-    holdout: int = HELD_OUT_EVERY
+    epochs: Count = 150
+    batch_size: BatchSize = 256
+    holdout: Annotated[int, Range(2, 1_000_000)] = HELD_OUT_EVERY
 
     def __post_init__(self):
-        for name, least in (("epochs", 1), ("batch_size", 1), ("holdout", 2)):
-            _check_count(f"training.{name}", getattr(self, name), least)
+        check(self, "training.")
 
 
 @dataclass(frozen=True)
@@ -84,31 +83,29 @@ class Study:
         ValueError: a name or count that no study can be run with.
     """
 
-    name: str
+    name: Annotated[str, Pattern(NAME, "a name of a-z, 0-9, '_' and '-'")]
     settings: dict[str, Setting]
     variants: dict[str, Variant]
     references: dict[str, int] = field(default_factory=dict)
     training: Training = field(default_factory=Training)
-    episodes: int = 10
-    eval_seed: int = 1000
+    episodes: Count = 10
+    eval_seed: Seed = 1000
 
     def __post_init__(self):
-        for name in (self.name, *self.settings, *self.variants):
-            if not NAME.fullmatch(name):
-                raise InputError(f"'{name}' is no name for a study, setting or variant; use a-z, 0-9, '_' and '-'.")
+        check(self)
+        for name in (*self.settings, *self.variants):
+            if not re.fullmatch(NAME, name):
+                raise InputError(f"'{name}' is no name for a setting or variant; use a-z, 0-9, '_' and '-'.")
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
                 raise InputError(f"A study needs at least one of {kind}.")
         names = [*self.settings, *self.variants, *self.references]
         if twice := [name for name in names if names.count(name) > 1]:
             raise InputError(f"'{twice[0]}' is the name of two things; settings, variants and references differ.")
-        _check_count("episodes", self.episodes)
-        if not 0 <= self.eval_seed < 2**31:
-            raise InputError(f"eval_seed must be a number from 0 to {2**31 - 1}, not {self.eval_seed}.")
         for name, seeds in self.references.items():
-            _check_count(f"references.{name}", seeds)
+            check_values(Variant, {"seeds": seeds}, f"references.{name}: ")
         for name, variant in self.variants.items():
-            _check_count(f"variants.{name}.seeds", variant.seeds)
+            check(variant, f"variants.{name}.")
             unknown = [setting for setting in variant.settings or [] if setting not in self.settings]
             if unknown:
                 known = ", ".join(self.settings)
@@ -148,18 +145,10 @@ class Options:
     """
 
     only: str = ""
-    together: int = 10
-    executor: str = "processes"
-    workers: int = 2
+    together: Count = 10
+    executor: Annotated[str, Among(EXECUTORS)] = "processes"
+    workers: Workers = 2
     retry_failed: bool = False
 
     def __post_init__(self):
-        for name in ("together", "workers"):
-            _check_count(name, getattr(self, name))
-        if self.executor not in EXECUTORS:
-            raise InputError(f"Unknown executor '{self.executor}'; choose one of: {', '.join(EXECUTORS)}.")
-
-
-def _check_count(name: str, count: int, least: int = 1) -> None:
-    if not (math.isfinite(count) and count >= least):
-        raise InputError(f"{name} must be at least {least}, not {count}.")
+        check(self)

@@ -15,7 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import distributions_of
-from lerobot_constructskill.artifacts.pools import cores, die_with_parent
+from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
 from lerobot_constructskill.artifacts.store import Store
 
 LOADERS = 4
@@ -144,7 +144,7 @@ def _call(command: list[str]) -> str:
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        preexec_fn=die_with_parent,
+        preexec_fn=be_killed_with_parent,
     )
     if done.returncode:
         lines = done.stdout.strip().splitlines() or ["nothing"]

@@ -205,8 +205,8 @@ def test_declared_comparisons_are_the_family(tmp_path):
         ({"labels": {"b": "B"}}, "Unknown name in labels 'b'; there are: one, two, fixed."),
         ({"comparisons": [["one"]]}, "A comparison is a pair of variants"),
         ({"comparisons": [["one", "one"]]}, "A comparison is a pair of variants"),
-        ({"alpha": 1.0}, "alpha must lie between 0 and 1, not 1.0"),
-        ({"alpha": float("nan")}, "alpha must lie between 0 and 1, not nan"),
+        ({"alpha": 1.0}, "analysis.alpha must be a finite number above 0 and at most 0.5, not 1.0"),
+        ({"alpha": float("nan")}, "analysis.alpha must be a finite number above 0 and at most 0.5, not nan"),
         ({"alhpa": 0.1}, "alhpa"),
     ],
 )

@@ -122,6 +122,17 @@ def scenario_generate(root: Path) -> None:
         record(GenerateConfig("local/set", str(root / "set"), episodes=2))
 
 
+def scenario_card(root: Path) -> None:
+    """The card of such a data set, with its pictures."""
+    from lerobot_constructskill.scripts.card import CardConfig, write_card
+
+    source = root.parent / "card_source"
+    if not source.exists():
+        source.mkdir(parents=True)
+        scenario_generate(source)
+    write_card(CardConfig(source / "set", out=root))
+
+
 def scenario_encode(root: Path) -> None:
     """The features of a small data set of images, by an encoder of a few numbers."""
     import numpy as np

@@ -9,7 +9,7 @@ import pytest
 
 SCRIPT = Path(__file__).with_name("crash_points.py")
 
-SCENARIOS = {"folder": None, "file": None, "store": None, "study": 30, "encode": 20, "generate": 15}
+SCENARIOS = {"folder": None, "file": None, "store": None, "study": 30, "encode": 20, "generate": 15, "card": None}
 """How many of a scenario's crash points are tried: all, or so many at equal distances."""
 
 FEWEST = 100

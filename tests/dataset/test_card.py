@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from toy import ToyEnv
 
 from lerobot_constructskill.contract import CAMERAS, FPS, TASKS
 from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import modality
+from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.scripts.generate import generate
 
 CARDS = Path(__file__).parents[2] / "datasets_cards"
 
@@ -105,3 +110,14 @@ def test_a_kept_card_is_what_its_facts_render_to(folder):
     generated = CARDS.parent / "outputs" / folder.name / "demonstrations"
     if generated.is_dir():
         assert card_facts(open_dataset(generated)) | {"repo_id": facts["repo_id"]} == facts
+
+
+@pytest.mark.slow
+def test_generating_writes_the_card_as_well(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(shards, "_environment", ToyEnv)
+    generate(GenerateConfig("local/toy", str(tmp_path / "one"), episodes=1))
+    assert "# local/toy" in (tmp_path / "one" / "README.md").read_text()
+    monkeypatch.setitem(sys.modules, "jinja2", None)
+    generate(GenerateConfig("local/toy", str(tmp_path / "two"), episodes=1))
+    assert "No card: jinja2 is not installed; pip install" in capsys.readouterr().out
+    assert file_hashes(tmp_path / "one") == file_hashes(tmp_path / "two")

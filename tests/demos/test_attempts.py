@@ -6,15 +6,18 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import pytest
 
+from lerobot_constructskill.artifacts import disk
 from lerobot_constructskill.demos import recorder, shards
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.demos.settings import frames_digest
 from lerobot_constructskill.demos.shards import Attempt
+from lerobot_constructskill.errors import InputError, MachineError
 
 CONFIG = GenerateConfig("local/set", episodes=6, seed_start=0)
 FAILS = {0, 3, 4, 8}
@@ -93,3 +96,23 @@ def test_machines_that_draw_the_robot_differently_are_not_mixed(tmp_path):
 
     with pytest.raises(ValueError, match="light_robot"):
         merge(CONFIG, [Attempt(0, True, 10, True), Attempt(1, True, 10, False)], tmp_path, tmp_path / "set")
+
+
+@pytest.mark.parametrize("content", ["", "[]", "null", '{"seed": 1}'])
+def test_an_attempt_that_lost_its_content_is_run_again(content, attempted, tmp_path):
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / shards.OUTCOME).write_text(content)
+    attempts = recorder._run_attempts(CONFIG, tmp_path)
+    assert sorted(attempted) == [attempt.seed for attempt in attempts] == list(range(10))
+    assert not (tmp_path / "1").exists()  # in the way of the new one
+
+
+def test_a_full_disk_is_said_in_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: SimpleNamespace(free=4096))
+    with pytest.raises(MachineError, match=f"The disk of {tmp_path} is full"), disk.room_for(tmp_path / "a" / "b"):
+        raise RuntimeError("Encoder thread failed: [Errno 28]")
+    with pytest.raises(InputError, match="another"), disk.room_for(tmp_path):
+        raise InputError("another")
+    monkeypatch.undo()
+    with pytest.raises(RuntimeError), disk.room_for(tmp_path):
+        raise RuntimeError("a fault of ours")

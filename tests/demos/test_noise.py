@@ -43,7 +43,7 @@ def test_a_covariance_without_full_rank_is_drawn_from():
         ({"model": "dart", "covariance": [[1.0, 2.0], [1.0]]}, "3 x 3"),
         ({"model": "dart", "covariance": [[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}, "symmetric"),
         ({"model": "dart", "covariance": np.diag([1.0, 1.0, -1.0]).tolist()}, "negative"),
-        ({"model": "dart", "covariance": np.diag([1.0, 1.0, np.nan]).tolist()}, "symmetric"),
+        ({"model": "dart", "covariance": np.diag([1.0, 1.0, np.nan]).tolist()}, "noise.covariance must be .* finite"),
     ],
 )
 def test_impossible_models_are_refused(bad, word):

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs.utils import (
     check_env_attributes_and_types,
@@ -20,6 +21,7 @@ from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.pick_place import PickPlaceExpert
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import InputError, MachineError, UserError
 
 HOVER = np.array([0, 0, 0, 1], dtype=np.float32)
 UP_CLOSED = np.array([0.02, -0.01, 0.05, -1], dtype=np.float32)
@@ -38,14 +40,14 @@ def env():
 )
 @pytest.mark.parametrize("build", [ConstructSkillEnv, ConstructSkillEnvConfig])
 def test_bad_fields_are_refused_in_one_sentence(build, field, value):
-    with pytest.raises(ValueError, match=str(value)) as refused:
+    with pytest.raises(UserError, match=str(value)) as refused:
         build(**{field: value})
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("field, value", [("max_parallel_tasks", 2), ("fps", 10)])
 def test_what_lerobot_offers_and_the_tasks_cannot_do_is_refused(field, value):
-    with pytest.raises(ValueError, match=field):
+    with pytest.raises(UserError, match=field):
         ConstructSkillEnvConfig(**{field: value})
 
 
@@ -82,7 +84,7 @@ def test_tasks_and_suites_can_be_named_together():
     "task, word", [("brick_to_bin,brick_to_bin_turned", "actions differ"), ("bins,brick_to_bin", "twice")]
 )
 def test_selections_that_no_policy_could_be_asked_are_refused(task, word):
-    with pytest.raises(ValueError, match=word):
+    with pytest.raises(UserError, match=word):
         ConstructSkillEnvConfig(task=task)
 
 
@@ -233,3 +235,19 @@ def test_an_episode_does_not_remember_the_one_before_it():
     for first, second in zip(*episodes, strict=True):
         np.testing.assert_array_equal(first["sim.object_pose"], second["sim.object_pose"])
         np.testing.assert_array_equal(first["observation.images.base"], second["observation.images.base"])
+
+
+@pytest.mark.sim
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_gpu_that_is_not_there_is_no_cpu_in_disguise():
+    env = ConstructSkillEnv(render_backend="gpu")
+    with pytest.raises(MachineError, match="render_backend must be auto or cpu on this machine"):
+        env.reset(seed=0)
+
+
+def test_a_suite_is_no_task_and_is_not_offered_as_one():
+    with pytest.raises(InputError, match="Unknown task 'bins'") as refusal:
+        ConstructSkillEnv("bins")
+    assert "suites" not in str(refusal.value)
+    with pytest.raises(UserError, match="the suites: bins, ladder, joints"):
+        ConstructSkillEnvConfig(task="brick")

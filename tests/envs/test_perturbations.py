@@ -5,6 +5,7 @@ import pytest
 
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.perturbations import AXES, Perturbation
 
 SEEN = set(AXES) - {"size"}
@@ -73,7 +74,7 @@ def test_a_task_without_a_brick_has_no_brick_size():
 
 @pytest.mark.parametrize("bad, word", [("colour=1", "camera"), ("camera=4", "0 to 3"), ("camera", "0 to 3")])
 def test_levels_that_do_not_exist_are_refused(bad, word):
-    with pytest.raises(ValueError, match=word):
+    with pytest.raises(UserError, match=word):
         ConstructSkillEnvConfig(perturb=bad)
 
 

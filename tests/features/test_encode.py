@@ -262,7 +262,7 @@ def test_an_interrupted_run_continues_with_its_next_episode(patches, source, wei
 
 @pytest.mark.parametrize("fields", [{"backbone": "resnet18"}, {"camera": "top"}, {"batch_size": 0}])
 def test_nonsense_leaves_nothing_behind(fields, source, weights, tmp_path):
-    with pytest.raises(ValueError, match="backbones are|cameras are|at least 1"):
+    with pytest.raises(ValueError, match="backbones are|cameras are|batch_size must be"):
         encode(settings(source, weights, tmp_path / "out", **fields))
     assert not list(tmp_path.iterdir())
 
@@ -272,7 +272,7 @@ def test_existing_folders_are_left_alone(source, weights, tmp_path):
     with pytest.raises(FileExistsError, match="exists already"):
         encode(settings(source, weights, tmp_path / "out"))
     shutil.rmtree(tmp_path / "out")
-    (tmp_path / "out.partial").mkdir()
+    (tmp_path / "out.partial" / "mine").mkdir(parents=True)
     with pytest.raises(FileExistsError, match="in the way"):
         encode(settings(source, weights, tmp_path / "out"))
 
@@ -282,3 +282,9 @@ def test_an_unwritable_folder_shows_before_anything_is_encoded(source, weights, 
     monkeypatch.setattr(features_encode, "load_encoder", lambda *args: pytest.fail("the encoder was loaded"))
     with pytest.raises(NotADirectoryError):
         encode(settings(source, weights, tmp_path / "file" / "out"))
+
+
+def test_a_backbone_without_weights_is_told_that_the_features_are_anothers(encoded, monkeypatch):
+    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: None)
+    with pytest.raises(ValueError, match=r"backbone vit_tiny16 \(the policy: clip_vitb16\)"):
+        make_policy(FrozenViTChunkConfig(backbone="clip_vitb16", device="cpu"), ds_meta=encoded.meta)

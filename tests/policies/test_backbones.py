@@ -9,12 +9,13 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit import encoder as encoder_module
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
-from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_wheel, state_sha256
+from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_tensors, read_wheel, state_sha256
 
 THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
 
@@ -192,3 +193,16 @@ def test_the_rebuilt_wheel_weights_act_like_the_graph_they_come_from(images, tmp
     with torch.no_grad():
         torch.testing.assert_close(encoder.model(pixels).last_hidden_state, expected, atol=1e-4, rtol=0)
         torch.testing.assert_close(encoder(images), expected[:, 0], atol=1e-4, rtol=0)
+
+
+class Hostile:
+    def __reduce__(self):
+        return print, ("run",)
+
+
+@pytest.mark.parametrize("content", [{"a": Hostile()}, [1, 2], {"a": 1}])
+def test_what_is_more_than_tensors_is_not_loaded_and_nobody_is_told_how_to(content, tmp_path, capsys):
+    torch.save(content, tmp_path / "weights.bin")
+    with pytest.raises(InputError, match="something other than named tensors") as refusal:
+        read_tensors(tmp_path / "weights.bin")
+    assert "weights_only" not in str(refusal.value) and "run\n" not in capsys.readouterr().out

@@ -1,8 +1,11 @@
 """What the configuration refuses, and what it takes from a data set."""
 
+import math
+
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature
 
+from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 
 CAMERA = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 480, 640))}
@@ -17,18 +20,23 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"backbone": "resnet18"}, "dinov2_vits14, clip_vitb16, vit_tiny16, vit_tiny16_augreg"),
         ({"backbone_precision": "float16"}, "auto, float32, bfloat16"),
         ({"gripper_head": "mse"}, "bce, regression"),
-        ({"chunk_size": 0}, "at least 1, got 0"),
-        ({"n_action_steps": 9, "temporal_ensemble_coeff": None}, "between 1 and chunk_size=8, got 9"),
+        ({"chunk_size": 0}, "from 1 to .*, not 0"),
+        ({"n_action_steps": 9, "temporal_ensemble_coeff": None}, "between 1 and chunk_size=8, not 9"),
         ({"n_action_steps": 2}, "must be 1 with temporal ensembling, got 2"),
-        ({"n_obs_steps": 2}, "got 2"),
-        ({"action_scale": 0.0}, "got 0.0"),
+        ({"n_obs_steps": 2}, "must be 1, not 2"),
+        ({"action_scale": 0.0}, "above 0 m and rad .* not 0.0"),
         ({"crop": [0.5, 0.0, 0.2, 1.0]}, r"left, top, right and bottom .* got \[0.5, 0.0, 0.2, 1.0\]"),
         ({"crop": [0.1, 0.9]}, r"got \[0.1, 0.9\]"),
-        ({"head_hidden_dim": 0}, "at least 1, got 0"),
+        ({"head_hidden_dim": 0}, "from 1 to .*, not 0"),
         ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention"),
         ({"readout": "mean", "standardize_features": True}, "readout=cls alone, got readout=mean"),
-        ({"regression_weight": 0}, "above 0, got 0"),
-        ({"scheduler_warmup_steps": -1}, "at least 0, got -1"),
+        ({"regression_weight": 0}, "above 0 .* not 0"),
+        ({"scheduler_warmup_steps": -1}, "from 0 to .* not -1"),
+        ({"regression_weight": math.nan}, "regression_weight must be a finite number above 0 .* not nan"),
+        ({"temporal_ensemble_coeff": math.nan}, "not nan"),
+        ({"gripper_threshold": math.nan}, "not nan"),
+        ({"action_scale": math.inf}, "not inf"),
+        ({"chunk_size": 1000}, "temporal_ensemble_coeff must be within 0.08 of 0 with chunk_size=1000"),
         ({"action_names": ["dx", "dy", "dz"]}, "gripper"),
         ({"action_names": ["gripper"]}, "one or more of"),
         ({"action_names": ["dx", "dx", "gripper"]}, "each once"),
@@ -36,7 +44,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
     ],
 )
 def test_nonsense_is_refused_with_the_valid_choices(fields: dict, said: str):
-    with pytest.raises(ValueError, match=said) as refusal:
+    with pytest.raises(UserError, match=said) as refusal:
         FrozenViTChunkConfig(device="cpu", **fields)
     assert "\n" not in str(refusal.value)
 
@@ -86,3 +94,17 @@ def test_the_state_is_an_input_on_request():
 def test_missing_inputs_are_named(fields: dict, inputs: dict, said: str):
     with pytest.raises(ValueError, match=said):
         FrozenViTChunkConfig(device="cpu", input_features=inputs, **fields).validate_features()
+
+
+def test_a_data_set_of_another_rate_is_refused():
+    action = {"action": {"dtype": "float32", "shape": (2,), "names": ["dx", "gripper"]}}
+    video = {"observation.images.base": {"dtype": "video", "info": {"video.fps": 30}}}
+    with pytest.raises(UserError, match="videos have 30 frames a second and the policy acts at 20 Hz"):
+        FrozenViTChunkConfig(device="cpu").set_dataset_feature_metadata(action | video)
+    FrozenViTChunkConfig(device="cpu", fps=30).set_dataset_feature_metadata(action | video)
+    FrozenViTChunkConfig(device="cpu").set_dataset_feature_metadata(action | {"observation.images.base": {}})
+
+
+def test_an_unknown_device_is_refused():
+    with pytest.raises(UserError, match="device must be one of cpu, cuda, mps, xpu, not 'quantum'"):
+        FrozenViTChunkConfig(device="quantum")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -9,8 +10,10 @@ import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
-from lerobot_constructskill.rollout.offline import Predictions, offline_metrics, predict
+from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
 EPISODES, CHUNK = [3, 7], 5
@@ -113,8 +116,9 @@ def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_s
     """Of chunks of one step the error is that which training found on the same held-out episodes."""
     trained = train_seeds(config(chunk_size=1), feature_set, [0, 1], epochs=3, batch_size=16, held_out=EPISODES)
     for policy, seed in zip(trained, [0, 1], strict=True):
-        save_checkpoint(policy, feature_set, tmp_path / f"seed_{seed}" / "pretrained_model")
-    found = f"{tmp_path}/seed_*/pretrained_model"
+        save_checkpoint(policy, feature_set, tmp_path / f"checkpoint_{seed}")
+        (tmp_path / f"checkpoint_{seed}" / "spec.json").write_text(json.dumps({"seed": seed}))
+    found = f"{tmp_path}/checkpoint_*"
     asked = OfflineConfig([found], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
     printed = evaluate_offline(asked)
     rows, table = json.loads((tmp_path / "offline.json").read_text()), pd.read_parquet(tmp_path / "offline.parquet")
@@ -135,3 +139,33 @@ def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
     (tmp_path / "config.json").touch()
     with pytest.raises(ValueError, match="among the 8 there are"):
         evaluate_offline(OfflineConfig([str(tmp_path)], "local/random", feature_set.root, episodes=[8]))
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["x", "y", "z", "gripper"], "must have the actions dx, dy, dz"),
+        (["dx", "dy", "dz"], "must have the actions dx, dy, dz"),
+        (None, "must have the actions dx, dy, dz"),
+        (["dx", "dy", "dz", "dyaw", "gripper"], "The policy acts in"),
+    ],
+)
+def test_a_policy_is_not_compared_with_other_actions(config, feature_set, names, said):
+    policy = train_seeds(config(chunk_size=1), feature_set, [0], epochs=1, batch_size=16)[0]
+    check_actions(policy, feature_set)
+    other = SimpleNamespace(repo_id="a/b", meta=SimpleNamespace(features={"action": {"names": names}}))
+    with pytest.raises(ValueError, match=said):
+        check_actions(policy, other)
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "{}", "null", "", '{"type": "frozen_vit", "chunk_size": NaN}', '{"type": 3}']
+)
+@pytest.mark.parametrize("file", ["config.json", "model.safetensors", "policy_preprocessor.json"])
+def test_a_damaged_checkpoint_is_a_sentence(config, feature_set, tmp_path, file, content):
+    policy = train_seeds(config(chunk_size=1), feature_set, [0], epochs=1, batch_size=16)[0]
+    save_checkpoint(policy, feature_set, tmp_path)
+    (tmp_path / file).write_text(content)
+    with pytest.raises(UserError) as refusal:
+        PolicyAgent.from_pretrained(tmp_path)
+    assert "\n" not in str(refusal.value)

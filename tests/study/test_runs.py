@@ -219,13 +219,16 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ),
         ({"variants": {"a": Variant({"type": "frozen_vit", "chunk_size": 0})}}, "variants.a.policy: chunk_size"),
         ({"variants": {"a": Variant(ACT, training={"epoch": 5})}}, "variants.a.training: .*epoch"),
-        ({"variants": {"a": Variant(ACT, training={"epochs": -2})}}, "variants.a.training: .*epochs must be at least"),
+        (
+            {"variants": {"a": Variant(ACT, training={"epochs": -2})}},
+            "variants.a.training: .*epochs must be a whole number from 1",
+        ),
         ({"variants": {"a": Variant(ACT, settings=["moved"])}}, "Unknown setting 'moved' of variant 'a'"),
         ({"variants": {"a": Variant(ACT, data="fasst")}}, "no file and no generate configuration 'fasst'"),
         ({"references": {"oracle": 1}}, "Unknown reference 'oracle'; there are: no_op"),
-        ({"references": {"random": 0}}, "references.random must be at least 1"),
-        ({"episodes": 0}, "episodes must be at least 1"),
-        ({"eval_seed": -1}, "eval_seed must be a number from 0"),
+        ({"references": {"random": 0}}, "references.random: seeds must be a whole number from 1"),
+        ({"episodes": 0}, "episodes must be a whole number from 1"),
+        ({"eval_seed": -1}, "eval_seed must be a whole number from 0"),
         ({"settings": {"fixed": Setting("smoke", {"task": "brick"})}}, "settings.fixed.env: Unknown task 'brick'"),
         ({"settings": {"fixed": Setting("smoke", {"foo": 1})}}, "settings.fixed.env: .*foo"),
         ({"settings": {"fixed": Setting("smoke", {"episode_length": -5})}}, "settings.fixed.env: episode_length"),
@@ -241,7 +244,7 @@ def test_a_study_that_cannot_be_run_is_refused_in_one_sentence_before_anything_r
 
 @pytest.mark.parametrize("recipe", [{"epochs": -2}, {"batch_size": 0}, {"holdout": 1}], ids=str)
 def test_a_recipe_that_trains_nothing_is_refused(recipe):
-    with pytest.raises(InputError, match=f"training.{next(iter(recipe))} must be at least"):
+    with pytest.raises(InputError, match=f"training.{next(iter(recipe))} must be a whole number from"):
         Training(**recipe)
 
 

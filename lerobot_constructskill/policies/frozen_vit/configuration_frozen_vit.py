@@ -1,24 +1,38 @@
 """Configuration of `--policy.type=frozen_vit`."""
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
+from lerobot_constructskill.errors import InputError, heard_by_lerobot
 
-from .backbones import IMAGE_SIZE, get_backbone
+from .backbones import BACKBONES, IMAGE_SIZE
 from .features import feature_key
-from .precision import AUTO, PRECISIONS, check_precision
+from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
 GRIPPER_NAME = "gripper"
 GRIPPER_HEADS = ("bce", "regression")
+
+LARGEST_EXPONENT = 80
+"""Of a weight in temporal ensembling: exp(88) is the last that float32 holds."""
+
+ChunkSize = Annotated[int, Range(1, 1000, unit="steps")]
+Width = Annotated[int, Range(1, 65_536)]
+Scale = Annotated[float, Range(above=0, most=10, unit="m and rad")]
+Logit = Annotated[float, Range(-100, 100)]
+Weight = Annotated[float, Range(above=0, most=1e9)]
+Rate = Annotated[float, Range(above=0, most=10)]
+Decay = Annotated[float, Range(0, 10)]
+DeviceName = Annotated[str, Pattern(r"(cpu|mps|xpu|cuda)(:\d{1,3})?", "one of cpu, cuda, mps, xpu")]
+Edge = Annotated[float, Range(0, 1)]
 
 
 @PreTrainedConfig.register_subclass("frozen_vit")
@@ -60,6 +74,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         use_state: whether the heads also see the normalised `observation.state`.
         head_hidden_dim: width of a hidden layer (GELU) in each of the two heads; None makes them linear, as the
             paper does.
+        fps: actions a second. A data set whose videos have another frame rate is refused.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
         action_scale: bound of the regression head, `action_scale * tanh(.)`, in metres (and radians).
@@ -78,9 +93,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
     """What trains it in a study, `study.trainers.Trainer`: many seeds at once, on features that are encoded once."""
 
-    n_obs_steps: int = 1
-    chunk_size: int = 8
-    n_action_steps: int = 1
+    device: DeviceName | None = None
+    n_obs_steps: Annotated[int, Range(1, 1)] = 1
+    chunk_size: ChunkSize = 8
+    n_action_steps: ChunkSize = 1
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -90,70 +106,63 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         }
     )
 
-    backbone: str = "dinov2_vits14"
-    backbone_path: str | None = None
+    backbone: Annotated[str, Among(tuple(BACKBONES))] = "dinov2_vits14"
+    backbone_path: Text | None = None
     backbone_pretrained: bool = True
     backbone_source: str | None = None
     backbone_sha256: str | None = None
-    backbone_precision: str = AUTO
-    backbone_trained_precision: str | None = None
+    backbone_precision: Annotated[str, Among((AUTO, *PRECISIONS))] = AUTO
+    backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
     save_backbone: bool = True
-    camera: str = "base"
-    crop: list[float] | None = None
+    camera: Word = "base"
+    crop: list[Edge] | None = None
     blind: bool = False
-    readout: str = "cls"
+    readout: Annotated[str, Among(tuple(READOUTS))] = "cls"
     standardize_features: bool = False
     use_state: bool = False
-    head_hidden_dim: int | None = None
+    head_hidden_dim: Width | None = None
 
+    fps: Annotated[int, Range(1, 1000, unit="Hz")] = 20
     action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
-    action_scale: float = 0.1
-    gripper_head: str = "bce"
-    gripper_threshold: float = 0.5
-    temporal_ensemble_coeff: float | None = -0.1
+    action_scale: Scale = 0.1
+    gripper_head: Annotated[str, Among(GRIPPER_HEADS)] = "bce"
+    gripper_threshold: Logit = 0.5
+    temporal_ensemble_coeff: Logit | None = -0.1
 
-    regression_weight: float = 1.0
-    optimizer_lr: float = 1e-3
-    optimizer_weight_decay: float = 1e-2
-    scheduler_warmup_steps: int | None = None
+    regression_weight: Weight = 1.0
+    optimizer_lr: Rate = 1e-3
+    optimizer_weight_decay: Decay = 1e-2
+    scheduler_warmup_steps: Annotated[int, Range(0, 100_000_000, unit="steps")] | None = None
 
     def __post_init__(self) -> None:
+        with heard_by_lerobot():
+            self._check()
         super().__post_init__()
         self._feature_column: dict[str, Any] | None = None
-        get_backbone(self.backbone)
-        check_precision(self.backbone_precision)
-        if self.backbone_trained_precision is not None:
-            _check_choice("backbone_trained_precision", self.backbone_trained_precision, PRECISIONS)
-        _check_choice("gripper_head", self.gripper_head, GRIPPER_HEADS)
-        _check_choice("readout", self.readout, tuple(READOUTS))
-        _check_crop(self.crop)
+
+    def _check(self) -> None:
+        check(self)
+        check_crop(self.crop)
         if self.standardize_features and self.readout != "cls":
             raise InputError(
                 f"standardize_features serves readout=cls alone, got readout={self.readout}: the statistics of a "
                 "feature set are those of its pooled feature."
             )
         _check_action_names(self.action_names)
-        if self.n_obs_steps != 1:
-            raise InputError(f"n_obs_steps must be 1 (frozen_vit sees one frame), got {self.n_obs_steps}.")
-        if self.chunk_size < 1:
-            raise InputError(f"chunk_size must be at least 1, got {self.chunk_size}.")
-        if not 1 <= self.n_action_steps <= self.chunk_size:
+        if self.n_action_steps > self.chunk_size:
             raise InputError(
-                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, got {self.n_action_steps}."
+                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}."
+            )
+        if abs(self.temporal_ensemble_coeff or 0) * self.chunk_size > LARGEST_EXPONENT:
+            raise InputError(
+                f"temporal_ensemble_coeff must be within {LARGEST_EXPONENT / self.chunk_size:g} of 0 with "
+                f"chunk_size={self.chunk_size}, or weights overflow, not {self.temporal_ensemble_coeff}."
             )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
             raise InputError(
                 f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
                 "temporal_ensemble_coeff=null to take several steps of one chunk."
             )
-        if self.scheduler_warmup_steps is not None and self.scheduler_warmup_steps < 0:
-            raise InputError(f"scheduler_warmup_steps must be at least 0, got {self.scheduler_warmup_steps}.")
-        if self.head_hidden_dim is not None and self.head_hidden_dim < 1:
-            raise InputError(f"head_hidden_dim must be at least 1, got {self.head_hidden_dim}.")
-        if self.regression_weight <= 0:
-            raise InputError(f"regression_weight must be above 0, got {self.regression_weight}.")
-        if self.action_scale <= 0:
-            raise InputError(f"action_scale must be above 0 (metres and radians), got {self.action_scale}.")
 
     @property
     def image_key(self) -> str:
@@ -179,6 +188,12 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         _check_action_names(names)
         if self.pretrained_path and names != self.action_names:
             raise InputError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
+        rates = {(feature.get("info") or {}).get("video.fps", self.fps) for feature in features.values()}
+        if others := rates - {self.fps}:
+            raise InputError(
+                f"The data set's videos have {others.pop()} frames a second and the policy acts at {self.fps} Hz: "
+                "train on a set of that rate, or say --policy.fps if what it is for runs at another."
+            )
         self.action_names = names
         self._feature_column = features.get(self.feature_key)
 
@@ -229,12 +244,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return None
 
 
-def _check_choice(field_name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(f"{field_name} must be one of {', '.join(choices)}, got '{value}'.")
-
-
-def _check_crop(crop: Any) -> None:
+def check_crop(crop: list[float] | None) -> None:
+    """Refuse edges that enclose no part of an image."""
     if crop is None:
         return
     left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)

@@ -63,13 +63,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._settle_precision()
         spec = get_backbone(config.backbone)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
+        self._check_column(config.backbone_sha256 or _encoders_sha256(config.feature_column))
         if load_backbone:
             check_native(config.backbone_precision, config.device)
             self._load_backbone()
-        if config.feature_column is not None:
-            trained_in = config.backbone_trained_precision
-            expected = describe(spec, config.backbone_sha256, trained_in, config.crop, config.blind)
-            check_features(config.feature_column, expected, spec.feature_dim)
+        self._check_column(config.backbone_sha256)
         self.readout = READOUTS[config.readout]
         self.patches_root = dataset_meta.root if dataset_meta is not None else None
         if config.feature_column is not None and self.readout.reads_patches:
@@ -196,6 +194,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         trained = made_in(config.feature_column) or config.backbone_trained_precision
         config.backbone_precision = resolve_precision(config.backbone_precision, config.device, trained)
         config.backbone_trained_precision = trained or config.backbone_precision
+
+    def _check_column(self, sha256: str | None) -> None:
+        """Refuse features of another encoder than this one with weights of that hash."""
+        config, spec = self.config, self.backbone.spec
+        if config.feature_column is not None:
+            made_by = describe(spec, sha256, config.backbone_trained_precision, config.crop, config.blind)
+            check_features(config.feature_column, made_by, spec.feature_dim)
 
     def _log_crossing(self, image: Tensor) -> None:
         precision, trained = self.config.backbone_precision, self.config.backbone_trained_precision

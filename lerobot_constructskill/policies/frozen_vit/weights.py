@@ -109,9 +109,17 @@ def read_tensors(path: Path) -> State:
     try:
         if path.suffix == ".safetensors":
             return load_file(path)
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (SafetensorError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:  # torch's own words advise to switch its guard off
+        state = None
+    except (SafetensorError, RuntimeError, EOFError) as error:
         raise InputError(f"'{path}' is damaged or truncated ({_reason(error)}): copy or download it again.") from None
+    if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
+        raise InputError(
+            f"'{path}' holds something other than named tensors, which is not loaded because it could run code: "
+            "give a model.safetensors from a source that you trust."
+        )
+    return state
 
 
 def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterator[tuple[State, str]]:

@@ -1,0 +1,112 @@
+"""Damaged files, each of them in each way: every command that reads a data set says in a sentence which one it is."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.dataset.card import card_facts
+from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.dataset.hub import PUSHED, open_lerobot
+from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
+from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.errors import InputError, MissingError, UserError
+from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
+
+JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
+BINARY = ("meta/tasks.parquet", "data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4")
+
+
+def truncate(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+
+
+WAYS: dict[str, Callable[[Path], object]] = {
+    "truncated": truncate,
+    "empty": lambda path: path.write_bytes(b""),
+    "gone": Path.unlink,
+    "a list": lambda path: path.write_text("[]"),
+    "an empty object": lambda path: path.write_text("{}"),
+    "null": lambda path: path.write_text("null"),
+    "text": lambda path: path.write_text('"x"'),
+}
+CASES = [(pattern, way) for pattern in JSON for way in WAYS] + [(p, way) for p in BINARY for way in list(WAYS)[:3]]
+
+
+@pytest.fixture(scope="module")
+def damaged(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Path]:
+    def damage(pattern: str, way: str) -> Path:
+        root = tmp_path_factory.mktemp("damaged") / "set"
+        shutil.copytree(pristine, root)
+        WAYS[way](next(root.glob(pattern)))
+        return root
+
+    return damage
+
+
+@pytest.mark.parametrize(("pattern", "way"), CASES)
+def test_a_damaged_file_is_named_by_the_check(damaged, pattern: str, way: str, monkeypatch, capsys) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    with pytest.raises(UserError) as refusal:
+        check_dataset(CheckConfig(root=damaged(pattern, way)))
+    said = capsys.readouterr().out + str(refusal.value)
+    assert Path(pattern).name in said or pattern.split("/")[0] in said
+
+
+@pytest.mark.parametrize(("pattern", "way"), [(pattern, way) for pattern, way in CASES if pattern in BINARY])
+def test_lerobot_opens_no_damaged_file(damaged, pattern: str, way: str) -> None:
+    with pytest.raises((UserError, OSError)):
+        open_lerobot("local/toy", damaged(pattern, way))
+
+
+def test_a_set_that_lerobot_has_edited_is_told_what_it_lacks(copy: Path) -> None:
+    (copy / SIDECAR).unlink()
+    with pytest.raises(MissingError, match="lerobot-edit-dataset drops it"):
+        check_dataset(CheckConfig(root=copy))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda facts: facts["generator"].update(repo_id="a/b](javascript:alert(1))"),
+        lambda facts: facts["generator"].update(repo_id="../../x"),
+        lambda facts: facts["versions"].update(torch="1\n# Heading"),
+        lambda facts: facts.update(attempts="<script>"),
+        lambda facts: facts.update(discarded_seeds=["<img>"]),
+    ],
+)
+def test_a_hostile_set_gets_no_card(pristine: Path, change) -> None:
+    data = open_dataset(pristine)
+    change(data.facts)
+    with pytest.raises(InputError):
+        card_facts(data)
+
+
+def test_a_policys_card_escapes_what_its_files_say(tmp_path: Path) -> None:
+    hostile = "x`\n# Heading <script>[a](javascript:b)"
+    train = {"seed": 0, "dataset": {"repo_id": hostile, "revision": hostile}}
+    card = render_outcomes([(0, 1, 1, 1)], "brick_to_bin", train, {"backbone": hostile})
+    assert "<script>" not in card and "](" not in card and "\n# Heading" not in card
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", "{}", "null", '{"per_task": 3}', '{"per_task": [[]]}', "", '{"per_task": [{}]}']
+)
+def test_an_evaluation_that_is_none_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / "seed_0").mkdir()
+    (tmp_path / "seed_0" / "eval_info.json").write_text(content)
+    with pytest.raises(InputError, match=r"eval_info\.json"):
+        seed_outcomes(tmp_path)
+
+
+def test_what_is_pushed_is_an_allow_list(copy: Path) -> None:
+    from huggingface_hub.utils import filter_repo_objects
+
+    for name in (".env", "notes.txt", ".cache/x.json", "data/key.pem", "pictures/private.png", "outputs/a.json"):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (copy / name).write_text("secret")
+    everything = [path.relative_to(copy).as_posix() for path in copy.rglob("*") if path.is_file()]
+    pushed = set(filter_repo_objects(everything, allow_patterns=PUSHED))
+    assert pushed == {name for name in everything if (copy / name).read_bytes() != b"secret"}

@@ -1,0 +1,120 @@
+"""Every field of every console command, by introspection, with values that break things: a sentence, or valid."""
+
+import importlib
+import math
+import tomllib
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from lerobot_constructskill import parsing
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.presets import find
+from lerobot_constructskill.scripts import console
+
+SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
+BARE = {"constructskill-doctor", "constructskill-config"}
+"""Commands without a configuration."""
+
+NEEDED = {
+    "repo_id": "alice/set",
+    "root": "set",
+    "task": "brick_to_bin",
+    "policies": "[checkpoint]",
+    "policy_path": "checkpoint",
+    "evaluations": "evaluations",
+    "out": "out.yaml",
+}
+"""Something valid for each field without a default."""
+
+BAD = ["nan", "inf", "-1", "0", "0.5", "1000000000", "", "[1]", "[]", "[nan]", "{a: 1}", "null", "true", ".", "../x"]
+BAD += ["é名\u0301", "a\\nb", "x" * 5000, "!!python/x 1"]
+
+
+@cache
+def config_classes() -> dict[str, type]:
+    """The configuration of every command, as its `main` hands it to `console.run`."""
+    found: dict[str, type] = {"frozen_vit": FrozenViTChunkConfig, "constructskill": ConstructSkillEnvConfig}
+    for command, entry in SCRIPTS.items():
+        if command in BARE:
+            continue
+        module = importlib.import_module(entry.split(":")[0])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                module, "run", lambda config_class, *_, name=command, **__: found.update({name: config_class})
+            )
+            module.main()
+    return found
+
+
+def flat_fields(config_class: type, before: str = "") -> list[str]:
+    """Names of fields as flags spell them, `noise.sigma` for instance."""
+    hints, names = get_type_hints(config_class), []
+    for field in fields(config_class):
+        inner = hints[field.name]
+        of_field = flat_fields(inner, f"{before}{field.name}.") if is_dataclass(inner) else []
+        names += [f"{before}{field.name}", *of_field]
+    return names
+
+
+def flags(command: str, config_class: type) -> list[str]:
+    if command == "constructskill-study":
+        return [f"--config_path={find('study', 'smoke')}"]
+    return [f"--{field.name}={NEEDED[field.name]}" for field in fields(config_class) if is_needed(field)]
+
+
+def is_needed(field: Any) -> bool:
+    return field.name in NEEDED and "MISSING" in repr(field.default) and "MISSING" in repr(field.default_factory)
+
+
+def numbers(value: Any) -> list[float]:
+    if is_dataclass(value):
+        return [number for field in fields(value) for number in numbers(getattr(value, field.name))]
+    if isinstance(value, list | tuple):
+        return [number for item in value for number in numbers(item)]
+    return [value] if isinstance(value, float) else []
+
+
+def outcome(config_class: type, arguments: list[str]) -> Any:
+    """The configuration, or the exception that the console makes a sentence of."""
+    try:
+        return parsing.parse(config_class, arguments)
+    except Exception as error:
+        return error
+
+
+CASES = [(command, field) for command, config_class in config_classes().items() for field in flat_fields(config_class)]
+
+
+def test_there_are_enough_of_them() -> None:
+    assert set(config_classes()) - {"frozen_vit", "constructskill"} == set(SCRIPTS) - BARE
+    assert len(CASES) * len(BAD) >= 400
+
+
+@pytest.mark.parametrize(("command", "field"), CASES)
+def test_a_bad_value_is_a_sentence_or_valid(command: str, field: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config_class = config_classes()[command]
+    for value in BAD:
+        made = outcome(config_class, [*flags(command, config_class), f"--{field}={value}"])
+        if isinstance(made, Exception):
+            status, said = console._judge(made)
+            assert status == console.REFUSED, f"{field}={value!r}: {type(made).__name__}: {said}"
+            assert said and "\n" not in said
+        else:
+            assert all(map(math.isfinite, numbers(made))), f"{field}={value!r} was accepted"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", [name for name in config_classes() if name in SCRIPTS])
+@pytest.mark.parametrize("name", ["../../../x", "a/../b", "/etc/x", "a", "a/b/c", "a/b\nc", "a/-b", "a b/c", ""])
+def test_no_name_leads_out_of_the_data_folder(command: str, name: str) -> None:
+    config_class = config_classes()[command]
+    for field in ("repo_id", "out_repo_id"):
+        if field in {one.name for one in fields(config_class)}:
+            made = outcome(config_class, [*flags(command, config_class), f"--{field}={name!r}"])
+            assert isinstance(made, Exception) and f"{field} must be user/name" in str(made)
