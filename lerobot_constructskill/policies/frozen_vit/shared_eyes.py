@@ -2,13 +2,10 @@
 
 import hashlib
 from collections.abc import Hashable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from .modeling_frozen_vit import FrozenViTChunkPolicy
 
 POOLED = "observation.pooled"
 """What `FrozenViTChunkPolicy.pool` returns for the image, in place of it in a batch."""
@@ -21,10 +18,10 @@ class SharedEyes:
     """Puts what their readouts take of an image in place of the image, for policies of which many may see alike.
 
     Args:
-        policies: by number. Those whose encoders are the same get one object.
+        policies: of frozen_vit, by number. Those whose encoders are the same get one object.
     """
 
-    def __init__(self, policies: "Mapping[int, FrozenViTChunkPolicy]"):
+    def __init__(self, policies: Mapping[int, PreTrainedPolicy]):
         self._groups: dict[Hashable, _Memory] = {}
         self._members: dict[int, Hashable] = {}
         for number, policy in policies.items():
@@ -56,7 +53,7 @@ class _Memory:
         capacity: numbers remembered (1.6 GB): a million pooled features, or 4,000 frames' patch features.
     """
 
-    def __init__(self, policy: "FrozenViTChunkPolicy", capacity: int = 400_000_000):
+    def __init__(self, policy: PreTrainedPolicy, capacity: int = 400_000_000):
         self.policy = policy
         self.capacity = capacity
         self._seen: dict[bytes, Tensor] = {}
@@ -80,7 +77,7 @@ class _Memory:
         return self.policy.pool(torch.cat(images)).split(1)
 
 
-def _eyes(policy: "FrozenViTChunkPolicy") -> Hashable:
+def _eyes(policy: PreTrainedPolicy) -> Hashable:
     """Equal for policies that take the same of an image."""
     config = policy.config
     encoder = config.backbone, config.backbone_sha256, config.backbone_precision, config.blind
