@@ -27,6 +27,10 @@ def data_sha256(root: Path) -> str:
     return total.hexdigest()
 
 
+finished_sha256 = cache(data_sha256)
+"""The same of a data set in a store, which does not change."""
+
+
 @cache
 def installed(package: str) -> str | None:
     """The version of an installed package; None where it is not installed."""

@@ -1,0 +1,1 @@
+"""What one does with a data set that is there: checks, card, replay, plots, Hub."""

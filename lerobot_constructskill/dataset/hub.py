@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dataset.frames import packet_times
 from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError
 
@@ -97,6 +98,18 @@ def _check_videos(dataset: "LeRobotDataset") -> None:
     for path, wanted in rows.items():
         if (found := len(packet_times(path, path.relative_to(dataset.root)))) < wanted:
             raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, its episodes have {wanted}.")
+
+
+def choose_held_out(dataset: "LeRobotDataset", episodes: list[int] | None) -> list[int]:
+    """The episodes that were named, or those that the contract holds out.
+
+    Raises:
+        InputError: there are none, or the data set has not all of them.
+    """
+    chosen = held_out(dataset.num_episodes) if episodes is None else episodes
+    if not chosen or not set(chosen) <= set(range(dataset.num_episodes)):
+        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {chosen}.")
+    return chosen
 
 
 @contextmanager

@@ -1,0 +1,1 @@
+"""Experts (pure numpy), noise, and the recorder of demonstrations."""

@@ -1,0 +1,1 @@
+"""What LeRobot sees: the environment configuration and the Gymnasium environments."""

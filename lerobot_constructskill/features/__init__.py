@@ -1,0 +1,1 @@
+"""A data set through an encoder, once, and how a study trains on the result."""

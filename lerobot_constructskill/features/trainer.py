@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import OBS_STATE
 
-from lerobot_constructskill.artifacts.digests import data_sha256, versions
+from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import MissingWeightsError
 from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
@@ -88,7 +87,7 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
     spec, patches = get_backbone(config.backbone), READOUTS[config.readout].reads_patches
     precision = config.backbone_trained_precision or config.backbone_precision
     made_by = describe(spec, config.backbone_sha256, precision, config.crop, config.blind)
-    source = {"demonstrations_sha256": _cached_sha256(demonstrations.root), "camera": config.camera}
+    source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
     made = Artifact("features", {**source, "patches": patches, "encoder": made_by, "versions": made_in})
     repo_id = f"local/{made.digest}"
@@ -106,7 +105,3 @@ def _backbone_line(config: FrozenViTChunkConfig) -> str:
     precision, trained = config.backbone_precision, config.backbone_trained_precision
     crossed = f", trained in {trained}" if trained != precision else ""
     return f"{config.backbone_source}, SHA-256 {config.backbone_sha256[:12]}, {precision}{crossed}"
-
-
-_cached_sha256 = cache(data_sha256)
-"""A finished data set does not change."""

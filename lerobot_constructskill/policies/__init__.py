@@ -1,0 +1,1 @@
+"""Policy types of our own. They run without a simulator."""

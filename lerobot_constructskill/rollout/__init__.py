@@ -1,0 +1,1 @@
+"""Agents and what drives them: LeRobot policies, the references, simulators in lockstep."""

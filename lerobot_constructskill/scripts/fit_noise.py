@@ -4,13 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from lerobot_constructskill.bounds import Device, Episode, NotEmpty, Range, RepoId, Text, check
-from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.bounds import Device, Episodes, Range, RepoId, Text, check
 from lerobot_constructskill.scripts.console import run
 
 Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
-Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass
@@ -43,7 +40,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.dataset.dataset import read_provenance
-    from lerobot_constructskill.dataset.hub import one_sentence, open_lerobot
+    from lerobot_constructskill.dataset.hub import choose_held_out, one_sentence, open_lerobot
     from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
     from lerobot_constructskill.demos.settings import GenerateConfig, generator_facts
     from lerobot_constructskill.parsing import decode
@@ -52,9 +49,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     dataset = open_lerobot(config.repo_id, config.root)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
-    episodes = config.episodes or held_out(dataset.num_episodes)
-    if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
-        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+    episodes = choose_held_out(dataset, config.episodes)
     with one_sentence(config.policy_path):
         device = config.device or str(auto_select_torch_device())
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)

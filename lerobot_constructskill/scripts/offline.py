@@ -8,13 +8,12 @@ from typing import Annotated
 
 from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.bounds import BatchSize, Device, Episode, NotEmpty, RepoId, Seed, Text, check
-from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.artifacts.store import SPEC
+from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
+from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.scripts.console import run
 
 Patterns = Annotated[list[Text], NotEmpty()]
-Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass
@@ -58,14 +57,12 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
-    from lerobot_constructskill.dataset.hub import open_lerobot
+    from lerobot_constructskill.dataset.hub import choose_held_out, open_lerobot
     from lerobot_constructskill.progress import Progress
 
     checkpoints = _find(config.policies)
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
-    episodes = held_out(dataset.num_episodes) if config.episodes is None else config.episodes
-    if not episodes or not set(episodes) <= set(range(dataset.num_episodes)):
-        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {episodes}.")
+    episodes = choose_held_out(dataset, config.episodes)
     source = {
         "episodes": ",".join(map(str, episodes)),
         "dataset": config.repo_id,
@@ -113,7 +110,7 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 def _training_seed(checkpoint: Path) -> int | None:
     """As `lerobot-train` keeps it, or a study."""
-    for path in (checkpoint / "train_config.json", checkpoint / "spec.json"):
+    for path in (checkpoint / "train_config.json", checkpoint / SPEC):
         if path.is_file():
             return json.loads(path.read_text()).get("seed")
     return None

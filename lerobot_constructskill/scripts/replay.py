@@ -2,13 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from lerobot_constructskill.bounds import Episode, NotEmpty, RepoId, Text, check
+from lerobot_constructskill.bounds import Episodes, RepoId, Text, check
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
-
-Episodes = Annotated[list[Episode], NotEmpty()]
 
 
 @dataclass

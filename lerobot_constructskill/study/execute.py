@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_constructskill.artifacts.digests import data_sha256, digest, file_sha256
+from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import get_task, held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
@@ -67,9 +67,8 @@ def make_runs(job: Job) -> Iterator[Run]:
     # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
     torch.set_flush_denormal(True)
     with job.store.claim([run.artifact for run in job.runs]) as claimed:
-        missing = {artifact.digest for artifact in claimed}
-        yield from (run for run in job.runs if run.artifact.digest not in missing)
-        runs = [run for run in job.runs if run.artifact.digest in missing]
+        yield from (run for run in job.runs if run.artifact not in claimed)
+        runs = [run for run in job.runs if run.artifact in claimed]
         failed = _train(job, runs)
         for run in runs:
             if run.seed in failed:
@@ -90,8 +89,7 @@ def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
         return {}
     trainer, failed = trainer_of(arm.policy), {}
     with job.store.claim([run.checkpoint for run in runs]) as claimed:
-        missing = {artifact.digest for artifact in claimed}
-        missing = [run for run in runs if run.checkpoint.digest in missing]
+        missing = [run for run in runs if run.checkpoint in claimed]
         for some in [missing] if trainer.seeds_together and missing else [[run] for run in missing]:
             try:
                 _fit(job, some)
@@ -210,8 +208,4 @@ def read_facts(checkpoint: Path) -> dict:
 
 def _dataset_sha256(job: Job) -> str | None:
     made = job.arm.demonstrations and job.arm.demonstrations.artifact
-    return _cached_sha256(job.store.folder(made)) if made and job.store.has(made) else None
-
-
-_cached_sha256 = cache(data_sha256)
-"""A finished data set does not change."""
+    return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

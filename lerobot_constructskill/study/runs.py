@@ -38,7 +38,7 @@ class Demonstrations:
     name: str
     config: GenerateConfig
 
-    @property
+    @cached_property
     def artifact(self) -> Artifact:
         return artifact(self.config)
 

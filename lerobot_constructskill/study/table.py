@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.store import LOG, Store
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO, read_facts
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
@@ -128,13 +128,13 @@ def status(table: Table) -> str:
     lines = []
     for (setting, name), runs in groupby(table.runs, key=lambda run: (run.arm.setting, run.arm.name)):
         runs = list(runs)
-        made = [rows for run in runs if (rows := table.episodes(run))]
-        failed = [rows[0] for rows in made if rows[0].error_kind]
+        made = [(run, rows[0]) for run in runs if (rows := table.episodes(run))]
+        failed = [(run, row) for run, row in made if row.error_kind]
         finished, missing = len(made) - len(failed), len(runs) - len(made)
         lines.append(f"{setting}/{name}: {finished} finished, {len(failed)} failed, {missing} missing")
-        for (kind, error), rows in groupby(failed, key=lambda row: (row.error_kind, row.error)):
-            rows = list(rows)
-            seeds = ", ".join(str(row.training_seed) for row in rows)
-            log = table.store.root / "runs" / rows[0].run / "log.txt"
+        for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
+            (first, _), *others = alike
+            seeds = ", ".join(str(run.seed) for run in (first, *(run for run, _ in others)))
+            log = table.store.folder(first.artifact) / LOG
             lines.append(f"    seeds {seeds} ({kind}): {error} (log: {log})")
     return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Tests, intervals and power for outcomes per training seed; numbers in, numbers out."""

@@ -1,0 +1,1 @@
+"""One file a task: what is loaded, where it starts, when it is done."""
