@@ -162,8 +162,8 @@ def _refusal(repo_id: str, status: int | None) -> str:
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
     """Put the folder of a data set on the Hub, in one commit, and tag it; return the commit's address.
 
-    Interrupted, the same call continues: the Hub keeps the files that arrived. The tag is set last, so what has one is
-    whole.
+    Interrupted, the same call continues: the Hub keeps the files that arrived. LeRobot's tag is set last, so what has
+    it is whole.
 
     Args:
         tag: a version of the data set, beside LeRobot's own tag, without which LeRobot loads nothing.
@@ -184,7 +184,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
         commit = api.upload_folder(**repo, folder_path=root, allow_patterns=PUSHED, delete_patterns=stale)
-        for name in filter(None, (CODEBASE_VERSION, tag)):
+        for name in filter(None, (tag, CODEBASE_VERSION)):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)
             api.create_tag(**repo, tag=name)

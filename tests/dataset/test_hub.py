@@ -2,7 +2,10 @@
 
 import multiprocessing
 import os
+import signal
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,7 @@ from hub_server import TOKENS, serve
 from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.dataset.hub import pull, push
 from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.errors import TakenError
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
 
 TOKEN = next(iter(TOKENS))
@@ -54,6 +58,31 @@ def count_frames(repo_id, revision):
     return len(LeRobotDataset(repo_id, revision=revision))
 
 
+def is_killed(number, after, *arguments, **options):
+    """Push in a process that is killed just before or just after its request `number`; whether there was one."""
+    child = os.fork()
+    if child == 0:
+        import httpx
+        from huggingface_hub import close_session
+
+        close_session()
+        send, numbers = httpx.Client.send, count()
+
+        def mortal(*its, **own):
+            is_last = next(numbers) == number
+            if is_last and not after:
+                os.kill(os.getpid(), signal.SIGKILL)
+            answer = send(*its, **own)
+            if is_last:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return answer
+
+        httpx.Client.send = mortal
+        push(*arguments, **options)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
 def refusal(call, *arguments, **options):
     """The one sentence with which a call is refused; it never holds the token."""
     with pytest.raises(OSError) as error:
@@ -88,6 +117,35 @@ def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine)
     machine(push, pristine, "alice/cut")
     assert len(hub.uploads) == len(set(hub.uploads)) > 2
     assert file_hashes(machine(pull, "alice/cut")) == file_hashes(pristine)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("update", [False, True])
+@pytest.mark.parametrize("after", [False, True])
+def test_a_push_killed_at_any_request_is_finished_by_the_same_command(update, after, hub, machine, tmp_path):
+    def folder(name, content):
+        for path in ("README.md", "meta/info.json", f"data/{content}.parquet"):
+            (tmp_path / name / path).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name / path).write_text(content)
+        return tmp_path / name
+
+    old, new = folder("old", "before"), folder("new", "behind")
+    wanted = {path.relative_to(new).as_posix(): b"behind" for path in new.rglob("*") if path.is_file()}
+    for number in count():
+        name = f"alice/killed_{after}_{update}_{number}"
+        hub.blobs.clear()
+        if update:
+            machine(push, old, name, tag="v1.0")
+        was_killed = machine(is_killed, number, after, new, name, tag="v1.0", update=update)
+        with suppress(TakenError):  # the last request was answered
+            machine(push, new, name, tag="v1.0", update=update)
+        repo = hub.repos[f"datasets/{name}"]
+        assert set(repo.tags) == {"v3.0", "v1.0"} and set(repo.tags.values()) == {repo.branches["main"]}
+        held = {path: hub.blobs[blob] for path, (blob, _) in repo.commits[repo.branches["main"]].items()}
+        assert held == wanted
+        if not was_killed:
+            break
+    assert number >= 8
 
 
 def test_a_whole_data_set_is_replaced_only_where_that_is_asked_for(hub, machine, pristine, copy):
