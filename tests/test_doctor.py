@@ -54,6 +54,8 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
         (checks.judge_weights(Probe(True, "a\tHub\nb", "")), Level.WARN),
         (checks.judge_weights(Probe(True, "a\t\nb", "")), Level.FAIL),
         (checks.judge_weights(BROKEN), Level.FAIL),
+        (checks.judge_fetched("a", Probe(True, "said before\nHub\t" + "0" * 64, "")), Level.OK),
+        (checks.judge_fetched("a", BROKEN), Level.WARN),
     ],
 )
 def test_judgement(finding: Finding, level: Level) -> None:

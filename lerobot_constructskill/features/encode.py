@@ -48,7 +48,7 @@ def load_encoder(
         ValueError: unknown backbone, damaged weights, or a precision that is unknown or not native to the device.
         FileNotFoundError: no source has the weights.
     """
-    spec = get_backbone(backbone)
+    spec = get_backbone(backbone, path)
     precision = resolve_precision(precision, device)
     check_native(precision, device)
     state, source = load_weights(spec, path, sha256, pretrained)

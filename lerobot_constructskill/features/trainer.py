@@ -33,7 +33,8 @@ class FeatureTrainer:
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
         """Write out what `auto` means here, and which weights there are; None where there are none."""
         precision = resolve_precision(config.backbone_precision, config.device)
-        sha256 = find_sha256(get_backbone(config.backbone), config.backbone_path, config.backbone_pretrained)
+        spec = get_backbone(config.backbone, config.backbone_path)
+        sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
 
     def fit(
@@ -81,10 +82,10 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
     Raises:
         FileNotFoundError: no source has the encoder's weights.
     """
+    spec, patches = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].reads_patches
     if config.backbone_sha256 is None:
-        load_weights(get_backbone(config.backbone), config.backbone_path)  # says what was tried
+        load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} came while the study ran: start it again.")
-    spec, patches = get_backbone(config.backbone), READOUTS[config.readout].reads_patches
     precision = config.backbone_trained_precision or config.backbone_precision
     made_by = describe(spec, config.backbone_sha256, precision, config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}

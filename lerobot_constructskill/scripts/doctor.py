@@ -14,6 +14,7 @@ from lerobot_constructskill.scripts.doctor_checks import (
     Level,
     Probe,
     judge_encoder,
+    judge_fetched,
     judge_ffmpeg,
     judge_mesa,
     judge_name,
@@ -66,6 +67,13 @@ for backbone in BACKBONES.values():
     print(backbone.name, find_source(backbone) or "", sep="\\t")
 """
 
+
+FETCH_WEIGHTS = """
+from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
+state, source = load_weights(get_backbone("{name}"))
+print(source, state_sha256(state), sep="\\t")
+"""
 
 # Random weights take as long as trained ones.
 ENCODE = """
@@ -143,13 +151,20 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
 )
 
 
+def fetching() -> list[Callable[[], Finding]]:
+    """A check for each backbone that fetches its weights, into the Hub's cache where that is their source."""
+    from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+
+    return [lambda name=name: judge_fetched(name, probe(FETCH_WEIGHTS.format(name=name))) for name in BACKBONES]
+
+
 def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
     """Run the checks, print each finding as it comes, and return the exit status: 1 where one failed."""
     levels = []
     for check in checks:
         finding = check()
         levels.append(finding.level)
-        print(f"{finding.level:<4}  {finding.name:<12}  {finding.message}", flush=True)
+        print(f"{finding.level:<4}  {finding.name:<17}  {finding.message}", flush=True)
     failed, warned = levels.count(Level.FAIL), levels.count(Level.WARN)
     print(f"{len(levels)} checks, {failed} failed, {warned} warned.")
     return int(failed > 0)
@@ -162,11 +177,14 @@ def main() -> None:
         "and the encoder's speed on this machine (about a minute). Exit status 1 where something fails.",
         epilog=EPILOG,
     )
+    parser.add_argument(
+        "--weights", action="store_true", help="fetch the weights of every backbone instead, check and name them"
+    )
     with edge():
-        _, unknown = parser.parse_known_args()
+        asked, unknown = parser.parse_known_args()
         if unknown:
             raise InputError(f"unrecognized arguments: {' '.join(unknown)}")
-        sys.exit(diagnose())
+        sys.exit(diagnose(fetching() if asked.weights else CHECKS))
 
 
 if __name__ == "__main__":

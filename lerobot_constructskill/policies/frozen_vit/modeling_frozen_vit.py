@@ -61,7 +61,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config = config
         self._settle_precision()
-        spec = get_backbone(config.backbone)
+        spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
         self._check_column(config.backbone_sha256 or _encoders_sha256(config.feature_column))
         if load_backbone:

