@@ -17,12 +17,14 @@ def demonstrate(
     noise: NoiseConfig,
     seed: int,
     labels: str = "clean",
+    stop_at_success: bool = True,
     watch: Callable[[Phase | None, dict[str, Any]], None] | None = None,
 ) -> tuple[list[dict[str, Any]], bool]:
     """Run one attempt from the initial state of `seed`, whose noise is a function of `seed` too.
 
     Args:
         labels: whether `action` is the expert's `clean` command or what was `executed`.
+        stop_at_success: whether it ends with the placement, or when the expert has finished.
         watch: called before every step with the phase it belongs to and the observation, and at the end with None and
             the last observation.
 
@@ -35,7 +37,7 @@ def demonstrate(
     sim = env.privileged_state()
     progress = expert.start(PrivilegedState(**sim))
     frames, success, truncated = [], False, False
-    while progress is not None and not (success or truncated):
+    while progress is not None and not ((success and stop_at_success) or truncated):
         clean, phase, progress = expert.act(PrivilegedState(**sim), progress)
         if watch:
             watch(phase, obs)
@@ -57,7 +59,7 @@ def demonstrate(
                 "sim.seed": np.array([seed], dtype=np.int64),
                 "next.reward": np.array([reward], dtype=np.float32),
                 "next.success": np.array([success]),
-                "next.done": np.array([success or truncated or progress is None]),
+                "next.done": np.array([(success and stop_at_success) or truncated or progress is None]),
             }
         )
     if watch:

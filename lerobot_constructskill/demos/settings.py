@@ -33,6 +33,8 @@ class GenerateConfig:
         max_failures: failed attempts, as a fraction of `episodes`, at which the run gives up.
         seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
         light_robot: as in the environment.
+        stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or when the expert
+            has finished: the steps in which the open hand waits above the bin show when to let go.
         labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
         expert: gains, thresholds and dwells.
         noise: what is added to the executed action.
@@ -53,6 +55,7 @@ class GenerateConfig:
     max_failures: Share = 1.0
     seed_start: Seed = DEMO_SEED_START
     light_robot: bool | None = None
+    stop_at_success: bool = True
     labels: Annotated[str, Among(LABELS)] = "clean"
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)

@@ -48,7 +48,7 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     task = get_task(config.task)
     expert = make_expert(task, config.expert)
     env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot)
-    frames, success = demonstrate(env, expert, config.noise, seed, config.labels)
+    frames, success = demonstrate(env, expert, config.noise, seed, config.labels, config.stop_at_success)
     light_robot = env.light_robot
     outcome = Attempt(seed, success, len(frames), light_robot)
     with staged(folder / str(seed)) as shard:

@@ -132,7 +132,7 @@ def list_runs(study: Study) -> list[Run]:
             runs += [Run(arm, seed) for seed in range(seeds)]
         for variant_name, variant in study.variants_in(name).items():
             arm = _variant_arm(study, variant_name, variant, sets[variant.data or setting.data], common)
-            runs += [Run(arm, seed) for seed in range(variant.seeds)]
+            runs += [Run(arm, seed) for seed in variant.training_seeds]
     return runs
 
 

@@ -32,10 +32,11 @@ class Variant:
 
     Args:
         policy: fields of a LeRobot policy, `type` among them.
-        seeds: training seeds 0 to `seeds` - 1.
+        seeds: how many training seeds, `first_seed` and those that follow it.
         data: other demonstrations than the setting's, for an ablation of the data.
         settings: names of the settings it runs in; all of them by default.
         training: fields of `Training` that differ from the study's.
+        first_seed: seeds that something is chosen on are not those that are reported (0 and up).
     """
 
     policy: dict[str, Any]
@@ -43,6 +44,11 @@ class Variant:
     data: str | None = None
     settings: list[str] | None = None
     training: dict[str, Any] = field(default_factory=dict)
+    first_seed: Seed = 0
+
+    @property
+    def training_seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.seeds)
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def scenario_generate(root: Path) -> None:
     from lerobot_constructskill.demos.settings import GenerateConfig
     from lerobot_constructskill.errors import TakenError
 
-    def demonstrate(env, expert, noise, seed, labels):
+    def demonstrate(env, expert, noise, seed, labels, stop_at_success):
         rng = np.random.default_rng(seed)
         features = demonstration_features(get_task("brick_to_bin"), "pixels")
         return [{name: invent(feature, rng) for name, feature in features.items()} for _ in range(3)], True

@@ -58,6 +58,8 @@ def make_all(of: Study, root: Path) -> Table:
 def test_thirty_seeds_after_ten_are_twenty_runs():
     ten, thirty = (study(variants={"a": Variant(ACT, seeds=seeds)}) for seeds in (10, 30))
     assert changed(ten, thirty) == {f"fixed/a/seed_{seed}" for seed in range(10, 30)}
+    elsewhere = study(variants={"a": Variant(ACT, seeds=2, first_seed=100)})
+    assert changed(ten, elsewhere) == {"fixed/a/seed_100", "fixed/a/seed_101"}
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
