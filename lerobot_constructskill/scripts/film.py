@@ -1,0 +1,68 @@
+"""`constructskill-film`: the scripted expert at work, as a video."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from lerobot_constructskill.bounds import Among, Seed, check
+from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
+from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.scripts.console import run
+
+VIEWS = ("close", "policy")
+
+
+@dataclass
+class FilmConfig:
+    """Film the scripted expert of a task in one episode."""
+
+    task: str = "brick_to_bin"  # a name in `contract.TASKS`
+    out: Path | None = None  # the video; outputs/<task>.mp4 when left out
+    view: Annotated[str, Among(VIEWS)] = "close"  # from close by, or what the policy's camera sees
+    seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
+    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))  # none by default
+    perturb: str = ""  # axis=level with commas between, as in the environment
+
+    def __post_init__(self):
+        check(self)
+        get_task(self.task)
+
+
+def film(config: FilmConfig) -> str:
+    """Write the video and return a line that says where, and how the episode ended.
+
+    Raises:
+        ValueError: no such task, view or perturbation.
+        OSError: there is nothing to render with, or the video cannot be written.
+    """
+    from lerobot.utils.io_utils import write_video
+
+    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.demos.demonstrate import demonstrate
+    from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.progress import Progress, quiet
+
+    out = config.out or Path("outputs") / f"{config.task}.mp4"
+    expert = make_expert(get_task(config.task), ExpertConfig())
+    env = ConstructSkillEnv(config.task, perturb=config.perturb)
+    frames = []
+
+    def watch(phase, obs):
+        frames.append(env.render() if config.view == "close" else obs["pixels"]["base"])
+        bar.update()
+
+    with Progress(desc=f"filming {config.task}", unit="step") as bar:
+        _, success = demonstrate(env, expert, config.noise, config.seed, watch=watch)
+    env.close()
+    with replaced(out) as partial, quiet():
+        write_video(partial, frames, FPS)
+    return f"{out}: {len(frames) / FPS:.0f} s, {'placed' if success else 'not placed'}"
+
+
+def main() -> None:
+    run(FilmConfig, film)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,39 @@
+"""README and docs: their links lead somewhere, they name what there is, and the README is short."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.contract import TASKS
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README_LINES = 150
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_of_a_page_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)]+)\)", page.read_text())
+    dead = [link for link in links if "://" not in link and not (page.parent / link.partition("#")[0]).exists()]
+    assert not dead
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_of_a_page_exist(page):
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    named = set(re.findall(r"constructskill-[a-z-]*[a-z]", page.read_text()))
+    assert named <= set(scripts)
+
+
+def test_the_readme_is_short_and_leads_to_every_page():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= README_LINES
+    assert all(f"(docs/{page.name})" in text for page in PAGES[1:])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_its_row_and_picture(task):
+    assert f"| `{task}` |" in (ROOT / "docs" / "tasks.md").read_text()
+    assert f"({Path('..') / 'examples' / 'pictures' / task}.jpg)" in (ROOT / "docs" / "tasks.md").read_text()
