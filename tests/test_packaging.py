@@ -134,7 +134,7 @@ def test_a_command_takes_a_name_a_file_or_a_flag(arguments: str) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [("'fsat'", "'fsat'; by name there are: dose/"), ("'fast', '--config_path=x'", "give one of them")],
+    [("'fsat'", "'fsat'; by name there are: direct, "), ("'fast', '--config_path=x'", "give one of them")],
 )
 def test_a_command_tells_what_is_wrong_with_a_name(arguments: str, said: str) -> None:
     code = COMMAND.format(arguments=arguments)
