@@ -167,6 +167,22 @@ def test_the_papers_set_is_as_long_as_the_paper_says(name, frames):
 
 
 @pytest.mark.sim
+def test_a_demonstration_goes_on_to_the_experts_end_where_it_is_asked_to():
+    """The set `direct`: all of RELEASE is there, no path rises before the grasp, and success is said to the end."""
+    config = draccus.parse(GenerateConfig, CONFIGS / "direct.yaml", args=["--repo_id=local/direct"])
+    env = ConstructSkillEnv(config.task, render_backend="none")
+    expert = make_expert(TASKS[config.task], config.expert)
+    whole, success = demonstrate(env, expert, NO_NOISE, config.seed_start, stop_at_success=config.stop_at_success)
+    placed, _ = demonstrate(env, expert, NO_NOISE, config.seed_start)
+    env.close()
+    assert success and sum(frame["phase"] == "RELEASE" for frame in whole) == config.expert.release_dwell
+    assert len(placed) < len(whole) and placed[-1]["next.done"] and not whole[len(placed) - 1]["next.done"]
+    assert whole[-1]["next.done"] and all(frame["next.success"] for frame in whole[len(placed) - 1 :])
+    heights = [frame["sim.tcp_pose"][2] for frame in whole if frame["phase"] in ("PREGRASP", "DESCEND")]
+    assert np.diff(heights).max() < 0.002
+
+
+@pytest.mark.sim
 def test_the_load_compensation_holds_the_brick_where_the_arm_alone_sags():
     """What `ExpertConfig.compliance` is for: a held brick sinks by centimetres a second where nothing is added."""
     env = ConstructSkillEnv("brick_to_bin", episode_length=300)
