@@ -12,8 +12,8 @@ PYTHONS = ((3, 12), (3, 13))
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
-DEMO_FRAMES = 8_623
-"""What `constructskill-generate fast_shifted_wrist` makes, and `make demo` encodes."""
+DEMO_FRAMES = 5_381
+"""What `constructskill-generate fast_shifted_wrist --episodes=50` makes, and `make demo` encodes."""
 
 OPENCV = (
     "opencv-python",
