@@ -69,6 +69,11 @@ def remedy_of(error: ModuleNotFoundError) -> str | None:
     return None
 
 
+def first_line(error: Exception) -> str:
+    """Of an error's message, or its class where it has none."""
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
 @contextmanager
 def heard_by_lerobot() -> Iterator[None]:
     """Make the block's `InputError` one that LeRobot's commands end in."""

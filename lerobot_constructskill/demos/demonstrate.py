@@ -36,8 +36,8 @@ def demonstrate(
     obs, _ = env.reset(seed=seed)
     sim = env.privileged_state()
     progress = expert.start(PrivilegedState(**sim))
-    frames, success, truncated = [], False, False
-    while progress is not None and not ((success and stop_at_success) or truncated):
+    frames, success, is_over = [], False, False
+    while not is_over:
         clean, phase, progress = expert.act(PrivilegedState(**sim), progress)
         if watch:
             watch(phase, obs)
@@ -48,6 +48,7 @@ def demonstrate(
             **{f"sim.{name}": value for name, value in sim.items()},
         }
         obs, reward, success, truncated, _ = env.step(executed)
+        is_over = progress is None or truncated or (success and stop_at_success)
         sim = env.privileged_state()
         frames.append(
             before
@@ -59,7 +60,7 @@ def demonstrate(
                 "sim.seed": np.array([seed], dtype=np.int64),
                 "next.reward": np.array([reward], dtype=np.float32),
                 "next.success": np.array([success]),
-                "next.done": np.array([(success and stop_at_success) or truncated or progress is None]),
+                "next.done": np.array([is_over]),
             }
         )
     if watch:

