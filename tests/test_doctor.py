@@ -30,9 +30,9 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1"}), Level.WARN),
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.7.0", "sapien": "3.0.3"}), Level.FAIL),
         (checks.judge_versions(REQUIREMENTS, {"sapien": "3.0.3"}), Level.FAIL),
-        (checks.judge_opencv(["opencv-python-headless"]), Level.OK),
-        (checks.judge_opencv(["opencv-python-headless", "opencv-python"]), Level.WARN),
-        (checks.judge_opencv([]), Level.FAIL),
+        (checks.judge_opencv({"opencv-python-headless": "4.12"}), Level.OK),
+        (checks.judge_opencv(dict.fromkeys(checks.OPENCV, "4.12")), Level.WARN),
+        (checks.judge_opencv({}), Level.FAIL),
         (checks.judge_mesa("25.0.7-2~bpo12+1", gpu=False), Level.OK),
         (checks.judge_mesa("24.3.0-1", gpu=False), Level.OK),
         (checks.judge_mesa("22.3.6-1+deb12u2", gpu=False), Level.FAIL),
@@ -65,8 +65,12 @@ def test_judgement(finding: Finding, level: Level) -> None:
 
 
 def test_complaints_name_their_cause() -> None:
-    assert "opencv-python and opencv-python-headless" in checks.judge_opencv(checks.OPENCV[:2]).message
-    assert "lerobot is 0.5 (needs <0.7,>=0.6.1)" in checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
+    both = dict.fromkeys(checks.OPENCV[:2], "4.12")
+    assert "-y opencv-python opencv-python-headless && pip install opencv-python-headless==4.12." in (
+        checks.judge_opencv(both).message
+    )
+    versions = checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
+    assert versions == "lerobot is 0.5 (needs <0.7,>=0.6.1); pip install 'lerobot[dataset]<0.7,>=0.6.1'."
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
     assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb", "")).message

@@ -141,7 +141,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     lambda: judge_python(sys.version_info[:2]),
     lambda: judge_name(list(installed_versions())),
     check_versions,
-    lambda: judge_opencv(list(installed_versions())),
+    lambda: judge_opencv(installed_versions()),
     lambda: judge_mesa(mesa_version(), has_gpu()),
     check_vulkan,
     lambda: judge_ffmpeg(probe(DECODE)),

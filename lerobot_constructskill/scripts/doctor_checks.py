@@ -8,12 +8,15 @@ from enum import StrEnum
 from lerobot_constructskill.errors import DISTRIBUTION
 
 PYTHONS = ((3, 12), (3, 13))
-"""Those that `make setup` takes, for which every pinned package has a wheel."""
+"""Those for which every pinned package has a wheel; setup.sh takes the same."""
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
 DEMO_FRAMES = 5_381
-"""What `constructskill-generate fast_shifted_wrist --episodes=50` makes, and `make demo` encodes."""
+"""What `constructskill-generate fast_shifted_wrist --episodes=50` makes."""
+
+REINSTALL = f"pip install --force-reinstall --no-deps '{DISTRIBUTION}', or the checkout's folder in its place"
+RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1 (Debian 12: from its backports)"
 
 OPENCV = (
     "opencv-python",
@@ -21,6 +24,7 @@ OPENCV = (
     "opencv-contrib-python",
     "opencv-contrib-python-headless",
 )
+LEROBOTS_OPENCV = "opencv-python-headless"
 
 
 class Level(StrEnum):
@@ -50,7 +54,7 @@ class Probe:
 def judge_python(version: tuple[int, int]) -> Finding:
     text = ".".join(map(str, version))
     if version < PYTHONS[0]:
-        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12; run `make setup`.")
+        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12: make an environment with that.")
     if version not in PYTHONS:
         return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 and 3.13 this was tested with.")
     return Finding(Level.OK, "Python", text)
@@ -64,9 +68,9 @@ def judge_name(names: Sequence[str]) -> Finding:
         return Finding(
             Level.FAIL,
             "Distribution",
-            "its name has hyphens, which LeRobot does not find; reinstall with pip or uv: `make setup`.",
+            f"its name has hyphens, which LeRobot does not find; {REINSTALL}.",
         )
-    return Finding(Level.FAIL, "Distribution", f"{DISTRIBUTION} is not installed; run `make setup`.")
+    return Finding(Level.FAIL, "Distribution", f"it is not installed; {REINSTALL}.")
 
 
 def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) -> Finding:
@@ -74,7 +78,7 @@ def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) ->
     from packaging.requirements import Requirement
     from packaging.utils import canonicalize_name
 
-    wrong, absent, right = [], set(), []
+    wrong, wanted, absent, right = [], [], set(), []
     for requirement in map(Requirement, requirements):
         marker = requirement.marker
         extras = [e for e in ("", "sim", "offline") if marker is None or marker.evaluate({"extra": e})]
@@ -85,23 +89,26 @@ def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) ->
             absent.add(extras[0])
         elif found is None or not requirement.specifier.contains(found, prereleases=True):
             wrong.append(f"{requirement.name} is {found or 'absent'} (needs {requirement.specifier})")
+            wanted.append(f"'{str(requirement).partition(';')[0].strip()}'")
         else:
             right.append(f"{requirement.name} {found}")
     if wrong:
-        return Finding(Level.FAIL, "Versions", f"{', '.join(wrong)}; run `make setup`.")
+        return Finding(Level.FAIL, "Versions", f"{', '.join(wrong)}; pip install {' '.join(wanted)}.")
     if absent:
         extra = ",".join(sorted(absent))
         return Finding(Level.WARN, "Versions", f"without the extra [{extra}]; pip install '{DISTRIBUTION}[{extra}]'.")
     return Finding(Level.OK, "Versions", ", ".join(right))
 
 
-def judge_opencv(names: Sequence[str]) -> Finding:
-    found = sorted(set(OPENCV) & set(names))
+def judge_opencv(installed: Mapping[str, str]) -> Finding:
+    """Compare the distributions with LeRobot's choice of one; ManiSkill's requirements bring a second."""
+    found = sorted(set(OPENCV) & set(installed))
     if len(found) > 1:
-        remedy = f"uninstall {' and '.join(found)}, then install opencv-python-headless alone."
-        return Finding(Level.WARN, "OpenCV", f"{' and '.join(found)} write into one cv2 folder; {remedy}")
+        kept = f"{LEROBOTS_OPENCV}=={installed[LEROBOTS_OPENCV]}" if LEROBOTS_OPENCV in found else LEROBOTS_OPENCV
+        remedy = f"pip uninstall -y {' '.join(found)} && pip install {kept}"
+        return Finding(Level.WARN, "OpenCV", f"{' and '.join(found)} write into one cv2 folder; {remedy}.")
     if not found:
-        return Finding(Level.FAIL, "OpenCV", "none is installed; pip install opencv-python-headless.")
+        return Finding(Level.FAIL, "OpenCV", f"none is installed; pip install {LEROBOTS_OPENCV}.")
     return Finding(Level.OK, "OpenCV", found[0])
 
 
@@ -115,13 +122,13 @@ def judge_mesa(version: str | None, gpu: bool) -> Finding:
         return Finding(
             Level.WARN,
             "Mesa",
-            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, run `make setup` (>= {wanted}).",
+            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, {RENDERER}, {wanted} or newer.",
         )
     if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
         return Finding(
             Level.FAIL,
             "Mesa",
-            f"{version}, but lavapipe renders for SAPIEN from {wanted} on; run `make setup`.",
+            f"{version}, but lavapipe renders for SAPIEN from {wanted} on; {RENDERER}.",
         )
     return Finding(Level.OK, "Mesa", str(version))
 
@@ -133,8 +140,8 @@ def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
         return Finding(
             Level.FAIL,
             "Vulkan",
-            f"SAPIEN finds no device to render with ({probe.reason}); run `make setup`, or on an NVIDIA "
-            "machine install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all).",
+            f"SAPIEN finds no device to render with ({probe.reason}); {RENDERER}, or on an NVIDIA machine "
+            "install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all).",
         )
     return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{probe.out}'")
 
@@ -146,7 +153,7 @@ def judge_plugin(probe: Probe) -> Finding:
     return Finding(
         Level.FAIL,
         "Plugin",
-        f"LeRobot does not find frozen_vit and constructskill ({reason}); run `make setup`.",
+        f"LeRobot does not find frozen_vit and constructskill ({reason}); {REINSTALL}.",
     )
 
 
@@ -163,7 +170,9 @@ def judge_ffmpeg(probe: Probe) -> Finding:
 def judge_weights(probe: Probe) -> Finding:
     """Judge lines of "backbone<tab>source", the source empty where there is none."""
     if not probe.ok:
-        return Finding(Level.FAIL, "Weights", f"could not be looked for ({probe.reason}); run `make setup`.")
+        return Finding(
+            Level.FAIL, "Weights", f"could not be looked for ({probe.reason}); mend what fails above first."
+        )
     sources = dict(line.partition("\t")[::2] for line in probe.out.splitlines())
     found = ", ".join(f"{name} ({source})" for name, source in sources.items() if source)
     missing = ", ".join(name for name, source in sources.items() if not source)
@@ -187,11 +196,11 @@ def judge_fetched(name: str, probe: Probe) -> Finding:
 def judge_encoder(probe: Probe) -> Finding:
     """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
     if not probe.ok:
-        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); run `make setup`.")
+        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); mend what fails above first.")
     precision, runtime, device, speed = probe.out.split()
     expected = (
         f"backbone_precision=auto is {precision} here, {float(speed):.0f} images/s of dinov2_vits14 by {runtime} on "
-        f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for the frames of `make demo`"
+        f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for 50 demonstrations"
     )
     if (runtime, device) == ("torch", "cpu"):
         return Finding(Level.WARN, "Encoder", f"{expected}; pip install '{DISTRIBUTION}[cpu]' to be faster.")

@@ -165,8 +165,7 @@ class PickPlaceEnv(BaseEnv):
             if not any(word in str(error).lower() for word in NO_DEVICE):
                 raise
             raise MachineError(
-                f"No Vulkan device to render with ({error}); `make setup` installs Mesa's software renderer and "
-                "`constructskill-doctor` tells what is missing."
+                f"No Vulkan device to render with ({error}); `constructskill-doctor` tells what is missing."
             ) from None
 
     @property
