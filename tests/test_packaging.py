@@ -1,9 +1,13 @@
 """What an installed copy owes: LeRobot finds it, its commands start fast, no file names a registry."""
 
 import json
+import os
+import re
 import subprocess
 import sys
+import tarfile
 import tomllib
+import zipfile
 from importlib import metadata
 from pathlib import Path
 
@@ -87,10 +91,53 @@ def test_help_does_not_wait_for_torch(command: str, target: str) -> None:
     run_python(HELP.format(command=command, module=module, function=function))
 
 
-def test_the_wheel_ships_every_configuration_where_an_installed_copy_looks() -> None:
-    shipped = PYPROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
-    assert shipped["configs"] == "lerobot_constructskill/configs"
-    assert presets.FOLDER == REPOSITORY / "configs"
+def front(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "lerobot_constructskill.scripts.front", *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_one_command_lists_the_others_and_starts_them() -> None:
+    listed = front().stdout
+    assert all(f"\n  {name.removeprefix('constructskill-')} " in listed for name in PROJECT["scripts"] if "-" in name)
+    assert front("--version").stdout.startswith(f"constructskill {PROJECT['version']} (Python ")
+    assert front("config", "train/act").stdout == f"{show('train/act')}\n"
+    assert front("generate", "fsat").stderr.startswith("constructskill-generate: There is no file and no")
+    unknown = front("genrate")
+    assert unknown.returncode == 1 and "'genrate'; there are: card, " in unknown.stderr
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a wheel, made through a source distribution as a package index gets it."""
+    folder = tmp_path_factory.mktemp("dist")
+    code = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, REPOSITORY]
+    done = subprocess.run(code, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    return folder
+
+
+def test_wheel_and_source_distribution_are_small_and_hold_the_package_alone(built: Path) -> None:
+    (wheel,), (source,) = built.glob("*.whl"), built.glob("*.tar.gz")
+    with zipfile.ZipFile(wheel) as archive, tarfile.open(source) as sources:
+        held, kept = archive.namelist(), sources.getnames()
+    rooms = {"lerobot_constructskill", "lerobot_env_constructskill.py", f"{wheel.name.rsplit('-', 3)[0]}.dist-info"}
+    assert {name.partition("/")[0] for name in held} == rooms
+    assert "lerobot_constructskill/py.typed" in held
+    assert not [name for name in kept if "/results/" in name or "/docs/" in name]
+    assert max(wheel.stat().st_size, source.stat().st_size) < 1e6
+
+
+def test_an_installed_copy_finds_its_configurations_from_an_empty_folder(built: Path, tmp_path: Path) -> None:
+    installed, elsewhere = tmp_path / "installed", tmp_path / "elsewhere"
+    zipfile.ZipFile(next(built.glob("*.whl"))).extractall(installed)
+    elsewhere.mkdir()
+    command = [sys.executable, "-m", "lerobot_constructskill.scripts.config"]
+    surroundings = os.environ | {"PYTHONPATH": str(installed)}
+    done = subprocess.run(command, env=surroundings, cwd=elsewhere, capture_output=True, text=True)
+    assert done.stdout.rstrip() == show(), done.stderr
+    one = subprocess.run([*command, "train/act"], env=surroundings, cwd=elsewhere, capture_output=True, text=True)
+    assert one.stdout.strip() == str(installed / "lerobot_constructskill" / "configs" / "train" / "act.yaml")
+    assert presets.FOLDER == REPOSITORY / "configs", "a checkout reads its own files"
 
 
 def test_every_configuration_has_a_name_and_says_what_it_is() -> None:
@@ -149,6 +196,11 @@ def own_files() -> list[str]:
     if done.returncode != 0:
         pytest.skip("not a git checkout")
     return [name for name in done.stdout.split("\0") if name and (REPOSITORY / name).is_file()]
+
+
+def test_no_message_of_an_installed_copy_needs_a_checkout() -> None:
+    sources = (REPOSITORY / "lerobot_constructskill").rglob("*.py")
+    assert not [path.name for path in sources if re.search(r"`make ", path.read_text())]
 
 
 def test_no_file_names_a_package_registry() -> None:
