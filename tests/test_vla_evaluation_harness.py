@@ -1,14 +1,24 @@
 """The adapter in examples/vla_evaluation_harness under the harness's own classes, with a real environment.
 
-Its Dockerfile is not built here, and the harness's web socket is left out: the expert answers in its place.
+In all but one test the expert answers in place of the harness's web socket. Its Dockerfile is not built here.
 """
 
 import asyncio
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
+from urllib.error import URLError
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 import yaml
+from commands import call
+from random_features import config, tiny_weights  # noqa: F401
 
 from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, REWARD_PLACED, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
@@ -97,8 +107,8 @@ def test_an_episode_is_its_seed(benchmark_class):
 
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["subname"])
 def test_every_entry_of_the_yaml_makes_a_benchmark(entry, benchmark_class):
-    config = EvalConfig.from_dict(entry)
-    benchmark = resolve_import_string(config.benchmark)(**config.params)
+    read = EvalConfig.from_dict(entry)
+    benchmark = resolve_import_string(read.benchmark)(**read.params)
     assert type(benchmark) is benchmark_class
     assert all(task["instruction"] == get_task(task["name"]).instruction for task in benchmark.get_tasks())
     assert benchmark.get_metadata()["max_steps"] == max(
@@ -117,3 +127,54 @@ def test_holding_keeps_the_gripper_and_moves_nothing(benchmark_class):
     benchmark = benchmark_class(tasks="brick_to_bin")
     assert benchmark.get_hold_action(None)["actions"].tolist() == [0, 0, 0, GRIPPER_OPEN]
     assert benchmark.get_hold_action({"actions": np.array([0.1, 0, 0, -1])})["actions"].tolist() == [0, 0, 0, -1]
+
+
+@pytest.fixture
+def untrained(config, tmp_path) -> Path:  # noqa: F811
+    """A checkpoint of frozen_vit as LeRobot keeps one, its heads random."""
+    from lerobot.configs import FeatureType, PolicyFeature
+    from lerobot.policies import make_pre_post_processors
+
+    from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
+
+    fields = config(save_backbone=True)
+    fields.input_features = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+    FrozenViTChunkPolicy(fields).save_pretrained(tmp_path / "untrained")
+    for processor in make_pre_post_processors(fields):
+        processor.save_pretrained(tmp_path / "untrained")
+    return tmp_path / "untrained"
+
+
+def wait_for(address: str, server: subprocess.Popen) -> None:
+    for _ in range(600):
+        assert server.poll() is None, "the server died"
+        try:
+            return urlopen(f"http://{address}/health").close()
+        except URLError:
+            time.sleep(0.5)
+    pytest.fail("the server does not answer")
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_a_checkpoint_acts_through_the_harnesss_own_server_and_web_socket(untrained, tmp_path, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    model = {"policy_type": "frozen_vit", "checkpoint": untrained, "device": "cpu", "use_select_action": "true"}
+    flags = [f"--args.{name}={value}" for name, value in model.items()]
+    entry = {
+        "server": {"url": f"ws://{address}"},
+        "output_dir": str(tmp_path),
+        "benchmarks": [ENTRIES[0] | {"episodes_per_task": 1, "params": {"tasks": "brick_to_bin", "max_steps": 3}}],
+    }
+    (tmp_path / "one.yaml").write_text(yaml.safe_dump(entry))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(FOLDER), *filter(None, [os.environ.get("PYTHONPATH")])]))
+    with subprocess.Popen([sys.executable, FOLDER / "model_server.py", f"--address={address}", *flags]) as server:
+        try:
+            wait_for(address, server)
+            printed = call("vla-eval", "run", f"--config={tmp_path / 'one.yaml'}", "--no-docker", "--render=cpu")
+        finally:
+            server.terminate()
+    (aggregate,) = tmp_path.glob("*_aggregate.json")
+    (episode,) = json.loads(aggregate.read_text())["tasks"][0]["episodes"]
+    assert episode["steps"] == 3 and episode["metrics"] == {"success": False, "lifted": False}, printed
