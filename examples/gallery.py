@@ -26,7 +26,8 @@ def main(pictures: str = "examples/pictures", films: str = "docs/films") -> None
         seen, close_ups = demonstration(task)
         tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])
         Image.fromarray(beside(*tiles)).save(Path(pictures) / f"{task.name}.jpg", quality=85)
-        write_video(Path(films) / f"{task.name}.mp4", [beside(*pair) for pair in zip(seen, close_ups)], FPS)
+        pairs = zip(seen, close_ups, strict=True)
+        write_video(Path(films) / f"{task.name}.mp4", [beside(*pair) for pair in pairs], FPS)
 
 
 def demonstration(task: Task) -> tuple[list[np.ndarray], list[np.ndarray]]:
