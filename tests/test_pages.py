@@ -1,5 +1,6 @@
 """README and docs: their links lead somewhere, they name what there is, and the README is short."""
 
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -34,6 +35,18 @@ def test_the_readme_is_short_and_leads_to_every_page():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_its_row_and_picture(task):
-    assert f"| `{task}` |" in (ROOT / "docs" / "tasks.md").read_text()
-    assert f"({Path('..') / 'examples' / 'pictures' / task}.jpg)" in (ROOT / "docs" / "tasks.md").read_text()
+def test_every_task_has_its_row_picture_limits_and_film(task):
+    text, _, limits = (ROOT / "docs" / "tasks.md").read_text().partition("## Known limits")
+    assert f"| `{task}` |" in text and f"| `{task}` |" in limits
+    assert f"({Path('..') / 'examples' / 'pictures' / task}.jpg)" in text
+    assert (ROOT / "docs" / "films" / f"{task}.mp4").stat().st_size < 200_000
+
+
+EXPERTS = json.loads((ROOT / "benchmarks" / "experts.json").read_text())
+
+
+@pytest.mark.parametrize("task", EXPERTS)
+def test_the_page_says_how_often_the_expert_succeeded(task):
+    states, failed = EXPERTS[task]["states"], EXPERTS[task]["failed"]
+    said = f"in `{task}` in {states - len(failed)} " if failed else "in 100 of 100 initial states of every task"
+    assert said in " ".join((ROOT / "docs" / "tasks.md").read_text().split()) and states == 100

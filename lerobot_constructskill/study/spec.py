@@ -138,8 +138,8 @@ class Options:
     """How a study is run.
 
     Args:
-        only: make only runs setting/variant/seed_N that fit this, such as `fixed` or `*/seed_[0-4]`; commas between
-            several.
+        only: make only runs setting/variant/seed_N that fit this, such as `fixed` or `fixed/*/seed_[0-4]`; commas
+            between several. (YAML reads a pattern that starts with `*` as something else, unless it is quoted twice.)
         together: seeds that are trained and evaluated in one pass.
         executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
             store on a file system that all its machines share).

