@@ -2,8 +2,12 @@
 
 import copy
 import importlib.util
+import os
 import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import huggingface_hub
 import pytest
@@ -252,3 +256,17 @@ def test_what_is_more_than_tensors_is_not_loaded_and_nobody_is_told_how_to(conte
     with pytest.raises(InputError, match="something other than named tensors") as refusal:
         read_tensors(tmp_path / "weights.bin")
     assert "weights_only" not in str(refusal.value) and "run\n" not in capsys.readouterr().out
+
+
+def test_openvino_reports_nothing_over_the_network(tmp_path):
+    """pip installs a package beside it that does, where `make setup` leaves it out."""
+    (tmp_path / "openvino_telemetry.py").write_text("raise SystemExit('it would report')")
+    code = (
+        "from lerobot_constructskill.policies.frozen_vit.openvino import import_openvino\n"
+        "import_openvino().convert_model\n"
+        "import openvino.tools.ovc.convert_impl as used\n"
+        "print(used.tm.__name__)"
+    )
+    surroundings = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])}
+    run = subprocess.run([sys.executable, "-c", code], env=surroundings, capture_output=True, text=True)
+    assert run.stdout.strip() == "openvino.tools.ovc.telemetry_stub", run.stderr

@@ -1,8 +1,10 @@
 """A backbone on a CPU through OpenVINO: faster than PyTorch, and blind to how images are batched."""
 
 import importlib.util
+import sys
 import warnings
 from collections.abc import Callable
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -15,6 +17,14 @@ Encode = Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
 
 def is_installed() -> bool:
     return importlib.util.find_spec("openvino") is not None
+
+
+def import_openvino() -> ModuleType:
+    """OpenVINO, but not the package that pip installs with it and that reports every conversion over the network."""
+    sys.modules.setdefault("openvino_telemetry", None)  # an import of it now fails, which OpenVINO takes for absent
+    import openvino
+
+    return openvino
 
 
 class OpenVINOEncoder:
@@ -32,8 +42,7 @@ class OpenVINOEncoder:
     """
 
     def __init__(self, model: nn.Module, encode: Encode, image_size: int, precision: str):
-        import openvino
-
+        openvino = import_openvino()
         example = torch.zeros(1, 3, image_size, image_size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # tracing warns of every shape that it takes for a constant
