@@ -5,11 +5,11 @@ from typing import Annotated, Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
+from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
 from .backbones import IMAGE_SIZE, check_backbone
 from .features import feature_key

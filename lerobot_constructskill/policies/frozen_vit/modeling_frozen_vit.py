@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
