@@ -97,7 +97,7 @@ class Meta:
         "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
     }
     stats = {"action": {"mean": np.zeros(4)}}
-    root = Path("nowhere")
+    root, fps = Path("nowhere"), 20
 
 
 def test_a_policy_is_told_what_its_data_set_is(monkeypatch):
@@ -113,7 +113,9 @@ def test_a_policy_is_told_what_its_data_set_is(monkeypatch):
         make_policy(FrozenViTChunkConfig(device="cpu"), ds_meta=Meta())
     asked = {"seen": Meta.features, "dataset_stats": Meta.stats}
     assert asked.items() <= told.items(), f"{LEROBOT}'s make_policy tells a policy other things of its data: {told}."
-    assert told["dataset_meta"].root == Meta.root, f"{LEROBOT}'s make_policy hands no dataset_meta to a policy."
+    assert (told["dataset_meta"].root, told["dataset_meta"].fps) == (Meta.root, Meta.fps), (
+        f"{LEROBOT}'s make_policy hands no dataset_meta to a policy."
+    )
     wanted = PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
     found = told["config"].input_features
     assert found == {"observation.images.base": wanted}, f"{LEROBOT}'s make_policy makes other inputs: {found}."
