@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig

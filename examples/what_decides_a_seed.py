@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from lerobot.utils.io_utils import write_video
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.contract import FPS
+from lerobot_constructskill.lerobot_internals import write_video
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import roll_out

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-from draccus.argparsing import ArgumentParser
 
 from lerobot_constructskill.errors import FieldError, InputError
+from lerobot_constructskill.lerobot_internals import ArgumentParser
 
 OURS = Path(__file__).parent
 

@@ -5,10 +5,10 @@ which is where LeRobot's `dataset.eval_split` takes its part.
 """
 
 import yaml
-from draccus.parsers.yaml_loader import FullLoaderWithInclusion
 
 from lerobot_constructskill.contract import held_out_last
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.lerobot_internals import FullLoaderWithInclusion
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 
 __all__ = ["ConstructSkillEnvConfig", "FrozenViTChunkConfig"]

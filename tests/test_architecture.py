@@ -14,11 +14,12 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 SIMULATOR = {"sapien", "mani_skill", "mplib"}
 
 # What a room, or a file with a row of its own, may import of ours, a room or a file of one; its own room and
-# these three go without saying.
-EVERYWHERE = ("bounds", "errors", "progress")
+# these four go without saying.
+EVERYWHERE = ("bounds", "errors", "lerobot_internals", "progress")
 ARROWS = {
     "bounds": (),
     "errors": (),
+    "lerobot_internals": (),
     "progress": (),
     "parsing": (),
     "presets": (),
@@ -73,6 +74,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 EXTERNALS = {
     "bounds": {"torch"},
     "errors": set(),
+    "lerobot_internals": set(),
     "progress": {"av", "tqdm"},
     "contract": set(),
     "presets": set(),

@@ -7,7 +7,7 @@ The package `lerobot_env_constructskill` with its extra `sim` has to be installe
 """
 
 import gymnasium as gym
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig

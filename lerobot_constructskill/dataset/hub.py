@@ -33,7 +33,7 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
         ValueError: neither a name nor a folder was given.
         FileNotFoundError: the folder, or the data set on the Hub, is not there.
     """
-    from lerobot.utils.constants import HF_LEROBOT_HOME
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
     if root is not None:
         if not root.is_dir():
@@ -53,8 +53,9 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
         OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
     """
     from huggingface_hub import snapshot_download
-    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
-    from lerobot.utils.constants import HF_LEROBOT_HUB_CACHE
+    from lerobot.datasets import CODEBASE_VERSION
+
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HUB_CACHE
 
     revision = revision or CODEBASE_VERSION
     with one_sentence(repo_id, revision):
@@ -174,7 +175,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         OSError: the Hub cannot be reached, or refuses the token or the name.
     """
     from huggingface_hub import HfApi
-    from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
+    from lerobot.datasets import CODEBASE_VERSION
 
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
     with one_sentence(repo_id):

@@ -7,6 +7,7 @@ from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import read_facts
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.lerobot_internals import largest_rewards
 
 
 def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
@@ -17,9 +18,9 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     """
     outcomes = []
     for path in folder.glob("seed_*/eval_info.json"):
-        tasks = read_facts(folder, str(path.relative_to(folder)))["per_task"]
+        info = read_facts(folder, str(path.relative_to(folder)))
         try:
-            stages = [stage for task in tasks for stage in task["metrics"]["max_rewards"]]
+            stages = largest_rewards(info)
             seed = int(path.parent.name.removeprefix("seed_"))
         except (TypeError, ValueError) as error:
             raise InputError(f"{path} is not what lerobot-eval writes ({error}).") from None

@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import PreTrainedPolicy
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress

@@ -50,7 +50,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
 
 def _aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
     """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
-    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets import aggregate_datasets
 
     while len(roots) > GROUP:
         groups = list(batched(roots, GROUP))
@@ -66,7 +66,9 @@ def _write_statistics(folder: Path) -> None:
 
     LeRobot averages the quantiles of episodes, which are not the data set's, and lists columns in the order of a set.
     """
-    from lerobot.datasets.io_utils import load_stats, write_stats
+    from lerobot.datasets import write_stats
+
+    from lerobot_constructskill.lerobot_internals import load_stats
 
     statistics = (load_stats(folder) or {}) | frame_statistics(folder)
     write_stats({name: statistics[name] for name in sorted(statistics)}, folder)
@@ -77,8 +79,7 @@ def frame_statistics(folder: Path) -> dict[str, dict[str, np.ndarray]]:
 
     It takes the variance as a difference of squares: in float32 an angle near pi that moves by 4 mrad has none.
     """
-    from lerobot.datasets.compute_stats import compute_episode_stats
-    from lerobot.datasets.io_utils import load_info
+    from lerobot_constructskill.lerobot_internals import compute_episode_stats, load_info
 
     features = load_info(folder).features
     statistics = {}

@@ -9,7 +9,7 @@ from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 
 if TYPE_CHECKING:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets import LeRobotDataset
 
 
 def artifact(config: GenerateConfig) -> Artifact:
@@ -24,7 +24,7 @@ def artifact(config: GenerateConfig) -> Artifact:
 
 def obtain_demonstrations(config: GenerateConfig, store: Store) -> "LeRobotDataset":
     """Return the data set of `config`. Raises as `recorder.record` does."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets import LeRobotDataset
 
     made = artifact(config)
     repo_id = f"local/{made.digest}"

@@ -47,7 +47,7 @@ def record(config: GenerateConfig) -> Summary:
         ValueError: more attempts failed than `max_failures` allows.
         OSError: the disk may not hold it, this machine cannot render, or a worker process died.
     """
-    from lerobot.utils.constants import HF_LEROBOT_HOME
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
     root = Path(config.root) if config.root else HF_LEROBOT_HOME / config.repo_id
     check_disk(config, root)

@@ -82,8 +82,8 @@ def _read(path: Path) -> Attempt | None:
 
 
 def _write_episode(config: GenerateConfig, frames: list[dict], root: Path) -> None:
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets import LeRobotDataset
 
     os.environ.setdefault("SVT_LOG", "1")
     with quiet():

@@ -6,15 +6,15 @@ from functools import partial
 from typing import Annotated, Any
 
 import gymnasium as gym
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.envs.configs import EnvConfig
-from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, ObsType, RenderBackend
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
+from lerobot_constructskill.lerobot_internals import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")

@@ -7,18 +7,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-from lerobot.datasets import LeRobotDataset
-from lerobot.datasets.compute_stats import compute_episode_stats
-from lerobot.datasets.dataset_tools import modify_features
-from lerobot.datasets.io_utils import write_stats
-from lerobot.datasets.video_utils import decode_video_frames
-from lerobot.utils.constants import DEFAULT_FEATURES
+from lerobot.datasets import LeRobotDataset, modify_features, write_stats
+from lerobot.utils import DEFAULT_FEATURES
 from torch import Tensor
 
 from lerobot_constructskill.artifacts.digests import data_sha256, digest
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
 from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key

@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies.factory import make_pre_post_processors
-from lerobot.utils.constants import OBS_STATE
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.store import Artifact, Store

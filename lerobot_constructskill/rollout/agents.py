@@ -10,9 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs.utils import preprocess_observation
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.envs import preprocess_observation
+from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import as_input

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from lerobot.datasets import LeRobotDataset
-from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.datasets import LeRobotDataset, resolve_delta_timestamps
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils import ACTION
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_constructskill.contract import GRIPPER, TRANSLATION

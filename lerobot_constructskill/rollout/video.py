@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
-from lerobot.utils.io_utils import write_video
 
 from lerobot_constructskill.contract import FPS
+from lerobot_constructskill.lerobot_internals import write_video
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.simulators import Step
 

@@ -42,10 +42,10 @@ print(device.name)
 """
 
 REGISTER = """
-from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_constructskill.lerobot_internals import register_third_party_plugins
 register_third_party_plugins()
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs import EnvConfig
 print("frozen_vit" in PreTrainedConfig.get_known_choices(), "constructskill" in EnvConfig.get_known_choices())
 """
 

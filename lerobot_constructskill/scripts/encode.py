@@ -50,11 +50,11 @@ def encode(config: EncodeConfig) -> Path:
         FileNotFoundError: the data set or the backbone's weights cannot be had.
         OSError: the output folder cannot be written, which shows before anything is encoded.
     """
-    from lerobot.utils.constants import HF_LEROBOT_HOME
-    from lerobot.utils.device_utils import auto_select_torch_device
+    from lerobot.utils import auto_select_torch_device
 
     from lerobot_constructskill.dataset.hub import open_lerobot
     from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
     out_repo_id = config.out_repo_id or f"{config.repo_id}_{re.sub(r'[^\w.-]', '_', config.backbone)}"
     out_root = config.out_root or HF_LEROBOT_HOME / out_repo_id

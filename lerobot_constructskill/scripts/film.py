@@ -35,12 +35,11 @@ def film(config: FilmConfig) -> str:
         ValueError: no such task, view or perturbation.
         OSError: there is nothing to render with, or the video cannot be written.
     """
-    from lerobot.utils.io_utils import write_video
-
     from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.demos.demonstrate import demonstrate
     from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
     from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.lerobot_internals import write_video
     from lerobot_constructskill.progress import Progress, quiet
 
     out = config.out or Path("outputs") / f"{config.task}.mp4"

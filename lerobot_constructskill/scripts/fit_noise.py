@@ -36,7 +36,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     """
     import numpy as np
     import yaml
-    from lerobot.utils.device_utils import auto_select_torch_device
+    from lerobot.utils import auto_select_torch_device
 
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.dataset.dataset import read_provenance

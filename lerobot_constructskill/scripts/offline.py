@@ -11,6 +11,7 @@ from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import SPEC
 from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
 from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.scripts.console import run
 
 Patterns = Annotated[list[Text], NotEmpty()]
@@ -110,7 +111,7 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 def _training_seed(checkpoint: Path) -> int | None:
     """As `lerobot-train` keeps it, or a study."""
-    for path in (checkpoint / "train_config.json", checkpoint / SPEC):
+    for path in (checkpoint / TRAIN_CONFIG, checkpoint / SPEC):
         if path.is_file():
             return json.loads(path.read_text()).get("seed")
     return None

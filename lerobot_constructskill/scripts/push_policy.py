@@ -6,6 +6,7 @@ from pathlib import Path
 from lerobot_constructskill.bounds import RepoId, check
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.scripts.console import run
 
 
@@ -34,7 +35,7 @@ def push_policy(config: PushPolicyConfig) -> str:
     from lerobot_constructskill.dataset.hub import one_sentence
     from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 
-    train, policy = (_read(config.policy_path / name) for name in ("train_config.json", "config.json"))
+    train, policy = (_read(config.policy_path / name) for name in (TRAIN_CONFIG, "config.json"))
     section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
     with one_sentence(config.repo_id):
         _push(config, section)
@@ -51,11 +52,11 @@ def _read(path: Path) -> dict:
 
 def _push(config: PushPolicyConfig, section: str) -> None:
     from huggingface_hub import ModelCard
-    from lerobot.configs.policies import PreTrainedConfig
-    from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.policies import get_policy_class, make_pre_post_processors
 
     import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig
 
     policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
     policy_config.repo_id, policy_config.private, policy_config.device = config.repo_id, config.private, "cpu"

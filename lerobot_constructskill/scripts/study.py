@@ -51,9 +51,8 @@ def study(config: StudyConfig) -> str:
         FileExistsError: another process is running it.
         ValueError: nothing can be run with a field of the study, or not one run succeeded.
     """
-    from lerobot.utils.import_utils import register_third_party_plugins
-
     import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
 
     register_third_party_plugins()
     from lerobot_constructskill.artifacts.store import Store

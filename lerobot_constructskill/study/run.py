@@ -90,7 +90,7 @@ def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
 
 
 def _make_all(job: Job) -> list[Run]:
-    from lerobot.utils.import_utils import register_third_party_plugins
+    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
 
     register_third_party_plugins()  # another machine knows neither our policy nor other packages' yet
     return list(make_runs(job))

@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs.configs import EnvConfig
-from lerobot.utils.device_utils import auto_select_torch_device
+from lerobot.envs import EnvConfig
+from lerobot.utils import auto_select_torch_device
 
 from lerobot_constructskill.artifacts.digests import distributions_of, versions
 from lerobot_constructskill.artifacts.store import Artifact

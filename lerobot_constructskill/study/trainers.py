@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_constructskill.artifacts.digests import distributions_of
 from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
 from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 
 LOADERS = 4
 """LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
@@ -120,7 +121,7 @@ class LeRobotTrainer(Trainer):
             with write() as folder:
                 output = folder.with_name(f"lerobot-train-{os.getpid()}")
                 said = _call([*command, f"--seed={seed}", f"--output_dir={output}"])
-                (output / "checkpoints" / "last" / "pretrained_model").resolve().rename(folder)
+                (output / LAST_CHECKPOINT).resolve().rename(folder)
                 (folder / "lerobot-train.log").write_text(said)
 
 

@@ -4,6 +4,8 @@ import math
 
 import pytest
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import make_policy
 
 from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -96,13 +98,16 @@ def test_missing_inputs_are_named(fields: dict, inputs: dict, said: str):
         FrozenViTChunkConfig(device="cpu", input_features=inputs, **fields).validate_features()
 
 
-def test_a_data_set_of_another_rate_is_refused():
-    action = {"action": {"dtype": "float32", "shape": (2,), "names": ["dx", "gripper"]}}
-    video = {"observation.images.base": {"dtype": "video", "info": {"video.fps": 30}}}
-    with pytest.raises(UserError, match="videos have 30 frames a second and the policy acts at 20 Hz"):
-        FrozenViTChunkConfig(device="cpu").set_dataset_feature_metadata(action | video)
-    FrozenViTChunkConfig(device="cpu", fps=30).set_dataset_feature_metadata(action | video)
-    FrozenViTChunkConfig(device="cpu").set_dataset_feature_metadata(action | {"observation.images.base": {}})
+@pytest.mark.parametrize("dtype", ["video", "image"])
+def test_a_data_set_of_another_rate_is_refused(dtype, tmp_path):
+    image = {"dtype": dtype, "shape": (224, 224, 3), "names": ["height", "width", "channels"]}
+    action = {"dtype": "float32", "shape": (2,), "names": ["dx", "gripper"]}
+    features = {"observation.images.base": image, "action": action}
+    meta = LeRobotDatasetMetadata.create("local/slow", 30, features, root=tmp_path / "slow")
+    tiny = {"device": "cpu", "backbone": "vit_tiny16", "backbone_pretrained": False}
+    with pytest.raises(UserError, match="data set has 30 frames a second and the policy acts at 20 Hz"):
+        make_policy(FrozenViTChunkConfig(**tiny), ds_meta=meta)
+    assert make_policy(FrozenViTChunkConfig(**tiny, fps=30), ds_meta=meta).config.fps == 30
 
 
 def test_an_unknown_device_is_refused():

@@ -5,11 +5,11 @@ from typing import Annotated, Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
 from lerobot.optim import AdamWConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
+from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
 from .backbones import IMAGE_SIZE, check_backbone
 from .features import feature_key
@@ -75,7 +75,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         use_state: whether the heads also see the normalised `observation.state`.
         head_hidden_dim: width of a hidden layer (GELU) in each of the two heads; None makes them linear, as the
             paper does.
-        fps: actions a second. A data set whose videos have another frame rate is refused.
+        fps: actions a second. A data set of another rate is refused.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
         action_scale: bound of the regression head, `action_scale * tanh(.)`, in metres (and radians).
@@ -190,14 +190,16 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         _check_action_names(names)
         if self.pretrained_path and names != self.action_names:
             raise InputError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
-        rates = {(feature.get("info") or {}).get("video.fps", self.fps) for feature in features.values()}
-        if others := rates - {self.fps}:
-            raise InputError(
-                f"The data set's videos have {others.pop()} frames a second and the policy acts at {self.fps} Hz: "
-                "train on a set of that rate, or say --policy.fps if what it is for runs at another."
-            )
         self.action_names = names
         self._feature_column = features.get(self.feature_key)
+
+    def check_rate(self, fps: int) -> None:
+        """Refuse a data set of another rate, in frames a second, than the policy acts at."""
+        if fps != self.fps:
+            raise InputError(
+                f"The data set has {fps} frames a second and the policy acts at {self.fps} Hz: train on a set of that "
+                "rate, or say --policy.fps if what it is for runs at another."
+            )
 
     def validate_features(self) -> None:
         """Narrow inputs to the one camera (and state) and outputs to `action`.

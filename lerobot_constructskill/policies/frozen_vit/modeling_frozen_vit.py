@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
@@ -40,7 +40,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     Raises:
         FileNotFoundError: the backbone's weights cannot be had, or the readout's patch features are not there.
-        ValueError: the data set's features are another encoder's, or the inputs do not fit the configuration.
+        ValueError: the data set's features are another encoder's, its rate is another than the policy's, or the inputs
+            do not fit the configuration.
     """
 
     config_class = FrozenViTChunkConfig
@@ -59,6 +60,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     ):
         super().__init__(config)
         config.validate_features()
+        if dataset_meta is not None:
+            config.check_rate(dataset_meta.fps)
         self.config = config
         self._settle_precision()
         spec = get_backbone(config.backbone, config.backbone_path)

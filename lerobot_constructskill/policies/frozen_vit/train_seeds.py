@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies.factory import make_policy, make_pre_post_processors
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state, vmap
 

@@ -1,0 +1,67 @@
+"""What this package uses of LeRobot that LeRobot does not export. Any release may move it, so it is named here alone.
+
+`from lerobot_constructskill.lerobot_internals import write_video` imports LeRobot's module then and no sooner. All
+else comes from LeRobot's packages by the names in their `__all__`: `from lerobot.datasets import LeRobotDataset`.
+tests/test_lerobot_internals.py holds both rules, and says in a sentence each what a new LeRobot has changed.
+"""
+
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lerobot_constructskill.errors import MachineError
+
+NAMES = {
+    # Vector environments that stand still after an episode's end, as LeRobot's own benchmarks make them.
+    "_LazyAsyncVectorEnv": "lerobot.envs.utils",
+    "freeze_after_episode_end": "lerobot.envs.utils",
+    # Statistics and files of data sets, read and written as LeRobot does it.
+    "compute_episode_stats": "lerobot.datasets.compute_stats",
+    "decode_video_frames": "lerobot.datasets.video_utils",
+    "load_info": "lerobot.datasets.io_utils",
+    "load_stats": "lerobot.datasets.io_utils",
+    "write_video": "lerobot.utils.io_utils",
+    # Where LeRobot keeps data sets, its own and those from the Hub.
+    "HF_LEROBOT_HOME": "lerobot.utils.constants",
+    "HF_LEROBOT_HUB_CACHE": "lerobot.utils.constants",
+    # Of training and of plugins.
+    "CosineAnnealingWithWarmupSchedulerConfig": "lerobot.optim.schedulers",
+    "TrainPipelineConfig": "lerobot.configs.train",
+    "register_third_party_plugins": "lerobot.utils.import_utils",
+    # Of draccus, by which LeRobot reads its configurations: the loader of YAML files, and the parser of flags.
+    "FullLoaderWithInclusion": "draccus.parsers.yaml_loader",
+    "ArgumentParser": "draccus.argparsing",
+}
+"""The modules that hold them."""
+
+LAST_CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
+"""Where `lerobot-train` leaves its newest checkpoint in its output folder."""
+
+TRAIN_CONFIG = "train_config.json"
+"""What a checkpoint of `lerobot-train` was trained with, beside its weights."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in NAMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    owner = NAMES[name]
+    try:
+        return getattr(import_module(owner), name)
+    except (AttributeError, ModuleNotFoundError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name not in _with_parents(owner):
+            raise  # a package that LeRobot itself lacks
+        raise MachineError(
+            f"LeRobot {version('lerobot')} has no {owner}.{name}, which this package needs: install a version that it "
+            "was tried with (docs/lerobot.md)."
+        ) from None
+
+
+def _with_parents(module: str) -> list[str]:
+    parts = module.split(".")
+    return [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
+
+
+def largest_rewards(eval_info: dict[str, Any]) -> list[float]:
+    """The largest reward of every episode in an `eval_info.json` of `lerobot-eval`, over all tasks."""
+    return [reward for task in eval_info["per_task"] for reward in task["metrics"]["max_rewards"]]
