@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from lerobot.utils.io_utils import write_video
 from PIL import Image
 from tqdm import tqdm
 
@@ -17,6 +16,7 @@ from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.lerobot_internals import write_video
 
 SIDE = 224
 

@@ -31,6 +31,9 @@ SHORT = {
 NOT_RUN = {
     "pip install": "changes the environment that the tests run in",
     "constructskill-doctor": "judges the machine, not the command: tests/test_doctor.py",
+    "uv venv": "makes an environment with another LeRobot",
+    "/tmp/other/": "runs in that environment",
+    "examples/smoke_evaluation.sh": "needs the checkout: tests/test_lerobots_evaluation.py",
     "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
     "constructskill-generate outputs/dart_1.yaml": "no demonstration succeeds under the noise of a policy that was "
     "trained for two steps: tests/test_end_to_end.py generates with less of it",

@@ -7,9 +7,10 @@ The server is the harness's own; this only lets LeRobot find its plugins first. 
 every step, which temporal ensembling needs; without it a chunk is executed whole.
 """
 
-from lerobot.utils.import_utils import register_third_party_plugins
 from vla_eval.model_servers.lerobot import LeRobotModelServer
 from vla_eval.model_servers.serve import run_server
+
+from lerobot_constructskill.lerobot_internals import register_third_party_plugins
 
 if __name__ == "__main__":
     register_third_party_plugins()
