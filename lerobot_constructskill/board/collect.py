@@ -9,7 +9,7 @@ from lerobot_constructskill.board.protocol import Setting
 from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import ROWS, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
 
 SEED = r"seed_(\d{1,9})"
 
@@ -51,8 +51,11 @@ def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
     failures: Failures = {}
     for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
         pile = piles.setdefault(int(row.training_seed), [])
-        if isinstance(row.error, str):
-            failures[int(row.training_seed)] = " ".join(row.error.split())[:300]
+        kind = row.error_kind if isinstance(row.error_kind, str) else None  # null is pandas' own
+        if kind == NOT_RUN:
+            raise MissingError(f"The study has not run {row.setting}/{variant}/seed_{row.training_seed} yet.")
+        if kind:
+            failures[int(row.training_seed)] = " ".join(str(row.error).split())[:300]
             continue
         path = store / "runs" / str(row.run) / RECORDINGS
         if not path.is_file():

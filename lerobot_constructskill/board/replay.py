@@ -91,9 +91,9 @@ def _run(jobs: Sequence[tuple[Setting, Sequence[Claim]]], workers: int, steps: i
 
 def _other_versions(there: dict[str, str], here: dict[str, str]) -> str:
     """What may be the reason for a difference that is nobody's fault."""
-    others = [f"{name} {there.get(name, 'unknown')!a} there, {ours} here" for name, ours in here.items()]
-    others = [said for said, (name, ours) in zip(others, here.items(), strict=True) if there.get(name) != ours]
-    return f" (other versions: {'; '.join(others)})" if others else " (with the same versions)"
+    other = {name: ours for name, ours in here.items() if there.get(name) != ours}
+    told = [f"{name} {str(there.get(name))[:40]!a} there, {ours} here" for name, ours in other.items()]
+    return f" (other versions: {'; '.join(told)})" if told else " (with the same versions)"
 
 
 def open_simulator(setting: Setting) -> ConstructSkillEnv:

@@ -21,7 +21,8 @@ import sys
 import numpy as np
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 first, count, seed = map(int, sys.argv[1:])
-env, rng = ConstructSkillEnv("brick_to_bin_shifted", episode_length=3, render_backend="none"), np.random.default_rng(seed)
+env = ConstructSkillEnv("brick_to_bin_shifted", episode_length=3, render_backend="none")
+rng = np.random.default_rng(seed)
 for start in range(first, first + count):
     env.reset(seed=start)
     for _ in range(3):
