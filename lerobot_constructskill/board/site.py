@@ -74,9 +74,11 @@ def _ranks(classes: Iterable[list[Entry]], column: str) -> dict[str, tuple[int, 
 
 
 def _place(entry: Entry, ranked: dict[str, dict[str, tuple[int, bool]]]) -> tuple:
-    """Where an entry is written: policies first, by class and by ranks, the worst compared first; then by name."""
+    """Where an entry is written: policies first, by class, by ranks, the worst compared first, by rates, by name."""
     own = sorted((of[entry.name][0] for of in ranked.values() if entry.name in of), reverse=True)
-    return entry.is_reference, CLASSES.index(entry.said.settings_class), not entry.is_ranked, own, entry.name
+    rates = [standing.placed.value for standing in entry.standings.values()]
+    kind = CLASSES.index(entry.said.settings_class)
+    return entry.is_reference, kind, not entry.is_ranked, own, -sum(rates) / len(rates), entry.name
 
 
 def grid(standing: Standing) -> Markup:

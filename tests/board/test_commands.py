@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,32 +18,28 @@ SETTINGS = {"shifted": {"task": "brick_to_bin_shifted", "episodes": 2, "episode_
 ABOUT = dict.fromkeys(("name", "submitter", "policy", "revision", "data", "training", "compute"), "a test's")
 
 EVALUATE = """
-import sys
+import os, sys
 import numpy as np
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-first, count, seed = map(int, sys.argv[1:])
+root, first = sys.argv[1], int(sys.argv[2])
 env = ConstructSkillEnv("brick_to_bin_shifted", episode_length=3, render_backend="none")
-rng = np.random.default_rng(seed)
-for start in range(first, first + count):
-    env.reset(seed=start)
-    for _ in range(3):
-        env.step(rng.uniform(-0.1, 0.1, 4).astype(np.float32))
+for seed in (0, 1):
+    os.environ["CONSTRUCTSKILL_RECORD"] = f"{root}/seed_{seed}"
+    rng = np.random.default_rng(seed)
+    for start in (first, first + 1):
+        env.reset(seed=start)
+        for _ in range(3):
+            env.step(rng.uniform(-0.1, 0.1, 4).astype(np.float32))
 env.close()
 """
 
 
-@pytest.fixture
-def evaluate(monkeypatch):
-    def run(folder, first):
-        for seed in (0, 1):
-            monkeypatch.setenv("CONSTRUCTSKILL_RECORD", str(folder / f"seed_{seed}"))
-            subprocess.run([sys.executable, "-c", EVALUATE, str(first), "2", str(seed)], check=True)
-        monkeypatch.delenv("CONSTRUCTSKILL_RECORD")
-
-    return run
+def evaluate(root: Path, first: int) -> None:
+    """Two training seeds' episodes from two starts, in a process that never renders."""
+    subprocess.run([sys.executable, "-c", EVALUATE, str(root), str(first)], check=True)
 
 
-def test_a_strangers_three_commands_and_a_rerun(evaluate, tmp_path):
+def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     (tmp_path / "about.yaml").write_text(yaml.safe_dump(ABOUT | {"observes": "pixels"}))
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump(SETTINGS))
     evaluate(tmp_path / "recorded", 7)
