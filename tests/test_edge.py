@@ -28,6 +28,8 @@ NEEDED = {
     "policy_path": "checkpoint",
     "evaluations": "evaluations",
     "out": "out.yaml",
+    "suite": "bins",
+    "about": "about.yaml",
 }
 """Something valid for each field without a default."""
 

@@ -21,6 +21,7 @@ from lerobot_constructskill.contract import (
     TRANSLATION,
     get_task,
 )
+from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.perturbations import Perturbation
 
@@ -86,6 +87,8 @@ class ConstructSkillEnv(gym.Env):
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
         self._cameras = () if render_backend == "none" else OBS_TYPES[obs_type]
+        self._told = {"task": task, "episode_length": self._max_episode_steps, "obs_type": obs_type}
+        self._told |= {"perturb": perturb, "perturb_seed": perturb_seed}
         self._scene_kwargs = {
             "cameras": self._cameras,
             "light_robot": light_robot,
@@ -94,6 +97,7 @@ class ConstructSkillEnv(gym.Env):
         }
         self._env = None
         self._steps = 0
+        self._recording = None
         self.observation_space = self._make_observation_space()
         self.action_space = self._make_action_space()
 
@@ -124,6 +128,7 @@ class ConstructSkillEnv(gym.Env):
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
         self._pixel_rng = np.random.default_rng([seed, self._perturbation.seed])
+        self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
         return self._observation(obs), self._info(info)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -137,8 +142,13 @@ class ConstructSkillEnv(gym.Env):
             raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
         obs, reward, terminated, _, info = self._env.step(self.maniskill_action(action))
         self._steps += 1
-        truncated = self._steps >= self._max_episode_steps
-        return self._observation(obs), float(reward[0]), bool(terminated[0]), truncated, self._info(info)
+        terminated, truncated, info = bool(terminated[0]), self._steps >= self._max_episode_steps, self._info(info)
+        if self._recording is not None:
+            self._recording.add(action, info)
+            if terminated or truncated:
+                keep(self._recording)
+                self._recording = None
+        return self._observation(obs), float(reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray:
         """A close-up of the scene, (H, W, 3) uint8."""

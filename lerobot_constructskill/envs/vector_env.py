@@ -4,6 +4,7 @@ With PhysX on a GPU one scene steps and renders hundreds of environments at once
 Not yet run on a GPU: here one environment is tested against `ConstructSkillEnv`, which it has to equal.
 """
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,8 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.errors import MachineError
+from lerobot_constructskill.envs.recording import FOLDER
+from lerobot_constructskill.errors import InputError, MachineError
 
 
 class NativeVectorEnv(gym.vector.VectorEnv):
@@ -28,10 +30,13 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         kwargs: those of `ConstructSkillEnv`.
 
     Raises:
+        InputError: episodes are to be recorded, which it cannot.
         OSError: there is no GPU for more than one (on the first `reset`).
     """
 
     def __init__(self, n_envs: int, **kwargs: Any):
+        if os.environ.get(FOLDER):
+            raise InputError(f"${FOLDER} records one environment a simulator; use vectorization=process with it.")
         self._single = ConstructSkillEnv(**kwargs)
         self.num_envs = n_envs
         self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}

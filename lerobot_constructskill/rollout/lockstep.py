@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.contract import STAGES, get_task
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.envs.recording import Outcome
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
@@ -16,35 +17,23 @@ OnStep = Callable[[int, int, np.ndarray, Step], None]
 
 
 @dataclass
-class Episode:
-    """How an evaluation episode went; the fields are those of `rows.Row`."""
+class Episode(Outcome):
+    """How an evaluation episode went; the fields are those of `rows.EpisodeRow`."""
 
-    evaluation_seed: int
-    lifted: bool = False
-    placed: bool = False
-    stage: str = STAGES[0]
-    lift_step: int | None = None
-    place_step: int | None = None
     final_error_m: float | None = None
-    steps: int = 0
 
     def add(self, step: Step) -> None:
         """Count one step of the episode."""
-        self.steps += 1
-        if step.info["is_lifted"] and not self.lifted:
-            self.lifted, self.lift_step = True, self.steps
-        if step.info["is_success"] and not self.placed:  # a task may ask for more than the paper's placement
-            self.placed, self.place_step = True, self.steps
-        reached = ("lifted", self.lifted), ("in_bin", step.info["is_in_bin"]), ("placed", self.placed)
-        self.stage = max([self.stage, *(stage for stage, is_reached in reached if is_reached)], key=STAGES.index)
+        self.count(step.info)
         self.final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
 
 
 @dataclass
 class Rollout:
-    """What became of one agent: its episodes, or why it failed."""
+    """What became of one agent: its episodes and the actions of each, or why it failed."""
 
     episodes: list[Episode] = field(default_factory=list)
+    actions: list[list[np.ndarray]] = field(default_factory=list)
     error: Exception | None = None
     backend: str | None = None
 
@@ -107,6 +96,7 @@ class _Lanes:
         self.current = self._settle(self.sims.step(actions))
         for i, step in self.current.items():
             self.outcomes[i].episodes[-1].add(step)
+            self.outcomes[i].actions[-1].append(actions[i])
             if self.on_step:
                 self.on_step(i, len(self.outcomes[i].episodes) - 1, actions[i], step)
         finished = [i for i, step in self.current.items() if step.done]
@@ -132,6 +122,7 @@ class _Lanes:
         seeds = {i: self.seeds[len(self.outcomes[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
             self.outcomes[i].episodes.append(Episode(seed))
+            self.outcomes[i].actions.append([])
         ready = self._settle({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})
         self.current |= self._settle(self.sims.reset({i: seeds[i] for i in ready}))
 

@@ -1,10 +1,11 @@
 """One piece of a study: some seeds of one arm, trained together, evaluated in lockstep, each kept as a run's folder.
 
-<store>/runs/<digest>/  spec.json  checkpoint (a link)  episodes.parquet  video.mp4 (of seed 0)  log.txt (if it failed)
+<store>/runs/<digest>/  spec.json  checkpoint (a link)  episodes.parquet  recordings.parquet (what was executed)
+                        video.mp4 (of seed 0)  log.txt (if it failed)
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from lerobot_constructskill.artifacts.digests import digest, file_sha256, finish
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import get_task, held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
@@ -159,7 +161,10 @@ def _agent(job: Job, run: Run) -> Agent:
 def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     row = _row(job, run, rollout.backend)
     rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
-    return _write(job, run, rows, write_video)
+    start = {name: job.arm.env[name] for name in STARTING}
+    told = {"backend": rollout.backend, **start}
+    pairs = zip(rollout.episodes, rollout.actions, strict=True)
+    return _write(job, run, rows, write_video, [Recording.of(episode, actions, **told) for episode, actions in pairs])
 
 
 def _write_failed(job: Job, run: Run, error: Exception) -> Run:
@@ -168,10 +173,18 @@ def _write_failed(job: Job, run: Run, error: Exception) -> Run:
     return _write(job, run, [replace(_row(job, run), error_kind=kind_of(error), error=said)])
 
 
-def _write(job: Job, run: Run, rows: list[EpisodeRow], write_video=lambda path: None) -> Run:
+def _write(
+    job: Job,
+    run: Run,
+    rows: list[EpisodeRow],
+    write_video: Callable[[Path], None] = lambda path: None,
+    recordings: Sequence[Recording] = (),
+) -> Run:
     with job.store.writing(run.artifact) as folder:
         folder.mkdir()
         write_rows(rows, folder / EPISODES, EpisodeRow)
+        if recordings:
+            write_recordings(recordings, folder / RECORDINGS)
         write_video(folder / VIDEO)
         if run.checkpoint and job.store.has(run.checkpoint):
             checkpoint = job.store.folder(run.checkpoint)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from lerobot_constructskill.artifacts.locks import locked
+from lerobot_constructskill.envs.recording import RECORDINGS, read_recordings
 from lerobot_constructskill.study.rows import read_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -188,6 +189,7 @@ def test_a_run_is_a_folder_with_all_that_belongs_to_it(undisturbed, folder):
         assert (own / "checkpoint" / "model.safetensors").is_file() == trained
         assert (own / "video.mp4").exists() == filmed == (row.training_seed == 0 and not failed)
         assert not filmed or (folder / "study" / row.video).stat().st_size > 1000
+        assert failed or [one.evaluation_seed for one in read_recordings(own / RECORDINGS)] == [1000, 1001]
         assert (own / "log.txt").exists() == failed and (not failed or "Traceback" in (own / "log.txt").read_text())
 
 

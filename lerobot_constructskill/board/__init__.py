@@ -1,0 +1,1 @@
+"""Results that anyone can check: submissions, their replay, and the board made of them."""

@@ -1,0 +1,135 @@
+"""From what was recorded to a submission: a study's runs, or folders that `$CONSTRUCTSKILL_RECORD` named."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
+from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
+
+SEED = r"seed_(\d{1,9})"
+
+type Piles = dict[int, list[Recording]]
+"""Training seed to what its policy did."""
+
+type Failures = dict[int, str]
+"""Training seed to why its run never finished."""
+
+
+def recorded_in(root: Path) -> Piles:
+    """What `root` holds, in a folder `seed_0`, `seed_1`, ... for each training seed.
+
+    Raises:
+        MissingError: there is no such folder.
+        InputError: a file in one is no recording.
+    """
+    folders = {int(found[1]): path for path in sorted(root.glob("seed_*")) if (found := re.fullmatch(SEED, path.name))}
+    if not folders:
+        raise MissingError(f"'{root}' has no folder seed_0, seed_1, ... of recordings.")
+    files = {seed: sorted(folder.rglob("*.parquet")) for seed, folder in folders.items()}
+    return {seed: [one for path in paths for one in read_recordings(path)] for seed, paths in files.items()}
+
+
+def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
+    """What a variant's runs did in all settings of a study, and why some failed.
+
+    Raises:
+        MissingError: the study, or what one of its runs executed, is not there.
+        InputError: the study has no such variant.
+    """
+    if not (root / ROWS).is_file():
+        raise MissingError(f"'{root}' is no folder of a study: {ROWS} is missing.")
+    rows = read_rows(root / ROWS)
+    own = rows[rows["variant"] == variant]
+    if own.empty:
+        raise InputError(f"The study has no variant '{variant}'; it has: {', '.join(rows['variant'].unique())}.")
+    piles: Piles = {}
+    failures: Failures = {}
+    for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
+        pile = piles.setdefault(int(row.training_seed), [])
+        kind = row.error_kind if isinstance(row.error_kind, str) else None  # null is pandas' own
+        if kind == NOT_RUN:
+            raise MissingError(f"The study has not run {row.setting}/{variant}/seed_{row.training_seed} yet.")
+        if kind:
+            failures[int(row.training_seed)] = " ".join(str(row.error).split())[:300]
+            continue
+        path = store / "runs" / str(row.run) / RECORDINGS
+        if not path.is_file():
+            raise MissingError(
+                f"'{path}' is missing: runs that were made before actions were kept cannot be replayed."
+            )
+        pile += read_recordings(path)
+    return piles, failures
+
+
+def submit(
+    root: Path, about: About, suite: str, settings: Mapping[str, Setting], piles: Piles, failures: Failures
+) -> Submission:
+    """Write a submission of what was recorded.
+
+    Args:
+        failures: training seeds whose missing episodes failed, and why; they stay in the denominator.
+
+    Raises:
+        TakenError: `root` exists.
+        InputError: an episode is missing or was recorded twice, or they do not belong together.
+    """
+    claims = []
+    for seed, pile in sorted(({seed: [] for seed in failures} | piles).items()):
+        for name, setting in settings.items():
+            found = _by_start(pile, setting)
+            claims += [_claim(name, setting, seed, start, found, failures.get(seed)) for start in setting.starts]
+    every = [one for pile in piles.values() for one in pile]
+    if not every:
+        raise InputError("Nothing was recorded.")
+    return write_submission(
+        root,
+        claims,
+        about=about,
+        suite=suite,
+        settings=dict(settings),
+        training_seeds=sorted(piles.keys() | failures.keys()),
+        backend=_one({one.backend for one in every}, "backends"),
+        versions=_versions(every),
+    )
+
+
+def _versions(recordings: Iterable[Recording]) -> dict[str, str]:
+    return json.loads(_one({one.versions for one in recordings}, "versions of packages"))
+
+
+def _one(different: set[str], what: str) -> str:
+    if len(different) > 1:
+        raise InputError(f"It was recorded with several {what}: {' and '.join(sorted(different))}; record with one.")
+    return different.pop()
+
+
+def _by_start(pile: Iterable[Recording], setting: Setting) -> dict[int, list[Recording]]:
+    """The recordings of a setting, by the seed of their start."""
+    found: dict[int, list[Recording]] = {}
+    for one in pile:
+        there = Setting(one.task, perturb=one.perturb, perturb_seed=one.perturb_seed).perturbation
+        same = (one.task, one.episode_length, there) == (setting.task, setting.episode_length, setting.perturbation)
+        if same:
+            found.setdefault(one.evaluation_seed, []).append(one)
+    return found
+
+
+def _claim(name: str, setting: Setting, seed: int, start: int, pile: dict, failure: str | None) -> Claim:
+    where = f"{name}, training seed {seed}, start {start}"
+    found = pile.get(start, [])
+    if not found and failure:
+        return Claim(start, setting=name, training_seed=seed, error=failure)
+    if not found:
+        raise InputError(
+            f"{where} was not recorded (task {setting.task}, {setting.episode_length} steps); evaluate it, or say in "
+            f"--failures why training seed {seed} failed."
+        )
+    if len({one.flat.tobytes() for one in found}) > 1:
+        raise InputError(f"{where} was recorded with different actions; record into a folder that is empty.")
+    went = {key: value for key, value in vars(found[0]).items() if key in vars(Claim(start)) and key != "actions"}
+    return Claim(**went, setting=name, training_seed=seed, actions=found[0].flat)

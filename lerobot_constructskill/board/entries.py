@@ -1,0 +1,132 @@
+"""The board's entries: submissions, what is known of each, and what their seeds reached in every setting."""
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_constructskill.analysis.stats.intervals import Estimate
+from lerobot_constructskill.analysis.stats.spread import mean_rate
+from lerobot_constructskill.board.protocol import CLAIMED, LEVELS, RANKED_FROM, TRAINING_SEEDS
+from lerobot_constructskill.board.submission import NAME, Claim, Declaration, Submission, read_submission
+from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.errors import InputError, MissingError
+
+ENTRIES, VERIFIED = "entries", "verified"
+"""Folders of a board: what strangers submit, and what its keepers found when they verified it."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What an entry reached in one setting.
+
+    Args:
+        claims: its episodes there, by training seed.
+        placed, lifted: mean over training seeds of the share of episodes, with its interval over seeds.
+        errors: episodes that failed with an error; they count as neither.
+    """
+
+    claims: dict[int, list[Claim]]
+    placed: Estimate
+    lifted: Estimate
+    errors: int
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A line of the board.
+
+    Args:
+        name: of its folder; its permalink.
+        submission: as it was opened.
+        level: one of `protocol.LEVELS`.
+        verdict: what its verification found; empty where nobody verified it.
+    """
+
+    name: str
+    submission: Submission
+    level: str
+    verdict: dict[str, Any]
+
+    @property
+    def said(self) -> Declaration:
+        return self.submission.declaration
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether it is a floor or a ceiling: it does not see what a policy sees, has no rank and misses no seeds."""
+        return self.said.about.observes not in OBS_TYPES
+
+    @property
+    def is_ranked(self) -> bool:
+        return not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
+
+    @property
+    def missing_seeds(self) -> int:
+        """How many of the protocol's training seeds it lacks."""
+        return 0 if self.is_reference else max(0, TRAINING_SEEDS - len(self.said.training_seeds))
+
+    @cached_property
+    def standings(self) -> dict[str, Standing]:
+        return {name: self._standing(name) for name in self.said.settings}
+
+    def _standing(self, setting: str) -> Standing:
+        claims = {seed: [] for seed in sorted(self.said.training_seeds)}
+        for claim in sorted(self.submission.claims, key=lambda claim: claim.key):
+            if claim.setting == setting:
+                claims[claim.training_seed].append(claim)
+        rng = np.random.default_rng(0)  # the same interval whenever the page is made
+        placed, lifted = (
+            mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]), rng)
+            for of in ("placed", "lifted")
+        )
+        return Standing(claims, placed, lifted, sum(one.error is not None for own in claims.values() for one in own))
+
+
+def read_entries(root: Path) -> list[Entry]:
+    """Every entry of a board's folder, by name.
+
+    Raises:
+        MissingError: there is no such folder.
+        InputError: an entry is no submission; the message names it.
+    """
+    if not (root / ENTRIES).is_dir():
+        raise MissingError(f"'{root}' is no board: it has no folder '{ENTRIES}'.")
+    return [_entry(root, path) for path in sorted((root / ENTRIES).iterdir())]
+
+
+def _entry(root: Path, path: Path) -> Entry:
+    if not NAME.allows(path.name):
+        raise InputError(f"The folder of an entry is called by {NAME.meaning}, not {path.name!a}.")
+    submission = read_submission(path)
+    verdict = _verdict(root / VERIFIED / f"{path.name}.json", submission)
+    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
+
+
+def _verdict(path: Path, submission: Submission) -> dict[str, Any]:
+    """What was found, if it was found of this very submission."""
+    if not path.is_file():
+        return {}
+    try:
+        verdict = json.loads(path.read_text())
+        known = verdict["level"] in LEVELS and isinstance(verdict["versions"], dict)
+    except (ValueError, KeyError, TypeError):
+        known = False
+    if not known:
+        raise InputError(f"'{path}' is no verdict of constructskill-verify.")
+    return verdict if verdict.get("submission") == submission.sha256 else {}
+
+
+def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
+    """Rank of each entry that has one in a setting, and whether it is shared.
+
+    An entry is behind those whose interval over seeds lies wholly above its own, and ties with all others: so entries
+    that the seeds cannot tell apart have one rank.
+    """
+    ranked = [entry for entry in entries if entry.is_ranked and setting in entry.standings]
+    placed = {entry.name: entry.standings[setting].placed for entry in ranked}
+    rank = {name: 1 + sum(other.low > own.high for other in placed.values()) for name, own in placed.items()}
+    return {name: (own, list(rank.values()).count(own) > 1) for name, own in rank.items()}

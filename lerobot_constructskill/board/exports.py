@@ -1,0 +1,142 @@
+"""The board's rows for others: one parquet file, LeRobot's eval_info.json, .eval_results, and vla-eval's board."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.board.entries import Entry
+from lerobot_constructskill.board.protocol import STANDARD
+from lerobot_constructskill.board.submission import Claim
+from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
+
+TABLE = "board.parquet"
+
+
+def write_table(entries: Iterable[Entry], path: Path) -> None:
+    """Every episode of every entry, a row each, without its actions."""
+    rows = [
+        {
+            "entry": entry.name,
+            "sha256": entry.submission.sha256,
+            "suite": entry.said.suite,
+            "class": entry.said.settings_class,
+            "level": entry.level,
+            **{one.name: getattr(claim, one.name) for one in fields(Claim) if one.name != "actions"},
+        }
+        for entry in entries
+        for claim in entry.submission.claims
+    ]
+    with replaced(path) as partial:
+        pq.write_table(pa.Table.from_pylist(rows), partial, compression="zstd")
+
+
+def eval_info(entry: Entry, seed: int) -> dict[str, Any]:
+    """What `lerobot-eval` would have written of one training seed; times and films are not known."""
+    per_task = [
+        {"task_group": setting, "task_id": 0, "metrics": _metrics(standing.claims[seed])}
+        for setting, standing in entry.standings.items()
+    ]
+    groups = {task["task_group"]: _aggregate([task]) for task in per_task}
+    return {"per_task": per_task, "per_group": groups, "overall": _aggregate(per_task)}
+
+
+def _metrics(claims: list[Claim]) -> dict[str, list]:
+    return {
+        "sum_rewards": [sum(_rewards(claim)) for claim in claims],
+        "max_rewards": [max(_rewards(claim)) for claim in claims],
+        "successes": [claim.placed for claim in claims],
+        "video_paths": [],
+    }
+
+
+def _rewards(claim: Claim) -> list[float]:
+    """The reward of every step: the stage reached by then."""
+    lifted, placed = (step or claim.steps + 1 for step in (claim.lift_step, claim.place_step))
+    steps = range(1, max(claim.steps, 1) + 1)
+    return [REWARD_PLACED if step >= placed else REWARD_LIFTED if step >= lifted else 0.0 for step in steps]
+
+
+def _aggregate(tasks: list[dict]) -> dict[str, Any]:
+    of = {name: [one for task in tasks for one in task["metrics"][name]] for name in tasks[0]["metrics"]}
+    return {
+        "avg_sum_reward": float(np.mean(of["sum_rewards"])),
+        "avg_max_reward": float(np.mean(of["max_rewards"])),
+        "pc_success": 100 * float(np.mean(of["successes"])),
+        "n_episodes": len(of["successes"]),
+        "video_paths": [],
+    }
+
+
+def eval_results(entry: Entry, dataset_id: str) -> str:
+    """`.eval_results/constructskill.yaml` for the repository of an entry's checkpoints.
+
+    Args:
+        dataset_id: the benchmark's repository on the Hub, whose eval.yaml names a task `<suite>_<setting>` for each.
+
+    Source: https://huggingface.co/docs/hub/eval-results.
+    """
+    from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
+
+    about = entry.said.about
+    seeds = f"mean of {len(entry.said.training_seeds)} training seeds, {entry.level}, {entry.said.settings_class}"
+    results = [
+        EvalResultEntry(
+            dataset_id=dataset_id,
+            task_id=f"{entry.said.suite}_{setting}",
+            value=round(100 * standing.placed.value, 2),
+            notes=f"{about.name}; per cent placed, {seeds}; submission {entry.submission.sha256[:16]}",
+        )
+        for setting, standing in entry.standings.items()
+    ]
+    return yaml.safe_dump(eval_result_entries_to_yaml(results), sort_keys=False, allow_unicode=True)
+
+
+def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
+    """leaderboard.json of vla-evaluation-harness, whose keepers still have to register the benchmark.
+
+    No overall score is given: the protocol has no number that hides the tasks. Only standard entries are.
+
+    Args:
+        day: when, ISO 8601.
+    """
+    results = [
+        {
+            "model": entry.name,
+            "display_name": entry.said.about.name,
+            "benchmark": f"constructskill_{entry.said.suite}",
+            "weight_type": "finetuned",
+            "overall_score": None,
+            "task_scores": {name: round(100 * one.placed.value, 2) for name, one in entry.standings.items()},
+            "curated_by": "constructskill-api",
+            "date_added": day,
+            "notes": f"{len(entry.said.training_seeds)} training seeds; {entry.level} by constructskill-verify.",
+        }
+        for entry in entries
+        if entry.said.settings_class == STANDARD
+    ]
+    return {"last_updated": day, "results": results}
+
+
+def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
+    """Write all of them: a folder for each entry in `exports`, and the files that are of all."""
+    write_table(entries, out / TABLE)
+    _write(out / "exports" / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2))
+    for entry in entries:
+        folder = out / "exports" / entry.name
+        for seed in entry.said.training_seeds:
+            _write(folder / f"seed_{seed}" / "eval_info.json", json.dumps(eval_info(entry, seed), indent=2))
+        if dataset_id:
+            _write(folder / ".eval_results" / "constructskill.yaml", eval_results(entry, dataset_id))
+
+
+def _write(path: Path, text: str) -> None:
+    with replaced(path) as partial:
+        partial.write_text(text.rstrip() + "\n")

@@ -1,0 +1,40 @@
+"""`constructskill-board`: the board's pages from a folder of submissions."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_constructskill.bounds import RepoId, check
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class BoardConfig:
+    """Write a page a suite, board.parquet, and exports for LeRobot, the Hub and vla-evaluation-harness."""
+
+    root: Path  # the board's folder, with entries/ and verified/
+    out: Path = Path("outputs/board")  # folder to write
+    dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; with it .eval_results are written too
+
+    def __post_init__(self):
+        check(self)
+
+
+def board(config: BoardConfig) -> str:
+    """Write the board and say where it is.
+
+    Raises:
+        MissingError: there is no board.
+        InputError: an entry is no submission.
+    """
+    from lerobot_constructskill.board.site import write_board
+
+    pages = write_board(config.root, config.out, config.dataset_id)
+    return f"{len(pages)} pages written; open {pages[-1]}"
+
+
+def main() -> None:
+    run(BoardConfig, board)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""`constructskill-submit`: a submission for the board from what was recorded."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from lerobot_constructskill.board.protocol import SUITES
+from lerobot_constructskill.bounds import Among, Text, check
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.scripts.console import run
+
+
+@dataclass
+class SubmitConfig:
+    """Make a submission's folder: submission.yaml and episodes.parquet, as docs/leaderboard.md says.
+
+    It is made of a study's runs, or of what environments recorded while `CONSTRUCTSKILL_RECORD` named
+    `recorded/seed_<training seed>`.
+    """
+
+    suite: Annotated[str, Among(tuple(SUITES))]  # whose settings and starts it is of
+    about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; url and notes if wanted
+    root: Path  # the folder to write
+    recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed
+    study: Path | None = None  # or a study's folder
+    variant: Text | None = None  # and the variant of it
+    store: Path = Path("outputs/store")  # where the study's runs are
+    settings: Path | None = None  # YAML of settings other than the suite's; the submission is then a custom one
+    failures: dict[str, str] = field(default_factory=dict)  # training seed to why its missing episodes failed
+
+    def __post_init__(self):
+        check(self)
+        if (self.recorded is None) == (self.study is None) or (self.study is None) != (self.variant is None):
+            raise InputError("Name what it is made of: --recorded, or --study with --variant.")
+        if bad := [seed for seed in self.failures if not (seed.isdecimal() and len(seed) < 10)]:
+            raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
+
+
+def submit(config: SubmitConfig) -> str:
+    """Write a submission and say what is in it.
+
+    Raises:
+        TakenError: the folder exists.
+        MissingError: something that was named is not there.
+        InputError: an episode is missing, or a file is not what it should be.
+    """
+    from lerobot_constructskill.board import collect
+    from lerobot_constructskill.board.strangers import make, read_yaml
+    from lerobot_constructskill.board.submission import EPISODES, About
+
+    about = make(About, read_yaml(config.about.read_bytes(), str(config.about)), str(config.about))
+    failures = {int(seed): why for seed, why in config.failures.items()}
+    if config.study is None:
+        piles = collect.recorded_in(config.recorded)
+    else:
+        piles, said = collect.of_study(config.study, config.store, config.variant)
+        failures = said | failures
+    settings = _settings(config)
+    made = collect.submit(config.root, about, config.suite, settings, piles, failures)
+    size = (config.root / EPISODES).stat().st_size
+    return (
+        f"{config.root}: {made.declaration.settings_class}, {len(made.claims)} episodes of "
+        f"{len(made.declaration.training_seeds)} training seeds, {size / 1e6:.2f} MB; now constructskill-verify."
+    )
+
+
+def _settings(config: SubmitConfig) -> dict:
+    from lerobot_constructskill.board.protocol import Setting
+    from lerobot_constructskill.board.strangers import make, read_yaml
+
+    if config.settings is None:
+        return SUITES[config.suite].settings
+    said = read_yaml(config.settings.read_bytes(), str(config.settings))
+    if not isinstance(said, dict):
+        raise InputError(f"'{config.settings}' must be a mapping of names to settings.")
+    return {name: make(Setting, of, f"{config.settings}, {name}") for name, of in said.items()}
+
+
+def main() -> None:
+    run(SubmitConfig, submit)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,365 @@
+"""Forged submissions: each function forges one in place, of a valid one in a folder, with a generator of its own.
+
+`READ` are refused when they are opened, `REPLAYED` only when their actions are executed: their author made the hashes
+anew, and all that they say could be.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import yaml
+
+from lerobot_constructskill.board.submission import DECLARATION, EPISODES
+
+type Forge = Callable[[Path, np.random.Generator], None]
+
+READ: dict[str, Forge] = {}
+REPLAYED: dict[str, Forge] = {}
+
+
+def forges(into: dict[str, Forge]) -> Callable[[Forge], Forge]:
+    def keep(forge: Forge) -> Forge:
+        into[forge.__name__] = forge
+        return forge
+
+    return keep
+
+
+def edit(root: Path, change: Callable[[list[dict]], None], schema: pa.Schema | None = None, **options) -> None:
+    """Change the rows, and make the hash anew."""
+    table = pq.read_table(root / EPISODES)
+    rows = table.to_pylist()
+    change(rows)
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema or table.schema), root / EPISODES, **options)
+    rehash(root)
+
+
+def rehash(root: Path) -> None:
+    declare(root, lambda said: said.update(episodes_sha256=hashlib.sha256((root / EPISODES).read_bytes()).hexdigest()))
+
+
+def declare(root: Path, change: Callable[[dict], None]) -> None:
+    said = yaml.safe_load((root / DECLARATION).read_text())
+    change(said)
+    (root / DECLARATION).write_text(yaml.safe_dump(said, sort_keys=False))
+
+
+def overwrite(root: Path, text: str) -> None:
+    """Put lines before submission.yaml's own."""
+    (root / DECLARATION).write_text(text + (root / DECLARATION).read_text())
+
+
+def placed(rows: list[dict], rng: np.random.Generator) -> dict:
+    return rng.choice([row for row in rows if row["placed"]])
+
+
+# Refused when opened
+
+
+@forges(READ)
+def a_bit_of_the_file(root, rng):
+    content = bytearray((root / EPISODES).read_bytes())
+    content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+    (root / EPISODES).write_bytes(content)
+
+
+@forges(READ)
+def an_action_without_its_hash(root, rng):
+    kept = (root / DECLARATION).read_text()
+    edit(root, lambda rows: placed(rows, rng)["actions"].__setitem__(int(rng.integers(300)), 0.05))
+    (root / DECLARATION).write_text(kept)
+
+
+@forges(READ)
+def a_dropped_failure(root, rng):
+    edit(root, lambda rows: rows.remove(rng.choice([row for row in rows if not row["placed"]])))
+
+
+@forges(READ)
+def a_success_in_a_failures_place(root, rng):
+    def change(rows):
+        good, bad = placed(rows, rng), rng.choice([row for row in rows if not row["placed"]])
+        rows[rows.index(bad)] = dict(good)
+
+    edit(root, change)
+
+
+@forges(READ)
+def a_success_copied_to_the_other_training_seed(root, rng):
+    def change(rows):
+        good = placed(rows, rng)
+        (other,) = (
+            row
+            for row in rows
+            if row["training_seed"] != good["training_seed"]
+            and (row["setting"], row["evaluation_seed"]) == (good["setting"], good["evaluation_seed"])
+        )
+        other.update({name: value for name, value in good.items() if name != "training_seed"})
+
+    edit(root, change)
+
+
+@forges(READ)
+def another_start(root, rng):
+    edit(root, lambda rows: rng.choice(rows).update(evaluation_seed=int(rng.integers(2**31))))
+
+
+@forges(READ)
+def a_swapped_training_seed(root, rng):
+    edit(root, lambda rows: rng.choice(rows).update(training_seed=int(rng.integers(2, 9))))
+
+
+@forges(READ)
+def an_unknown_setting(root, rng):
+    edit(root, lambda rows: rng.choice(rows).update(setting=rng.choice(["../../etc", "", "x" * 9999, "a\x00b", "名"])))
+
+
+@forges(READ)
+def an_action_that_is_no_number(root, rng):
+    bad = float(rng.choice([np.nan, np.inf, -np.inf]))
+    edit(root, lambda rows: placed(rows, rng)["actions"].__setitem__(int(rng.integers(300)), bad))
+
+
+@forges(READ)
+def too_few_actions(root, rng):
+    def change(rows):
+        row = rng.choice(rows)
+        row["actions"] = row["actions"][: int(rng.integers(len(row["actions"])))]
+
+    edit(root, change)
+
+
+@forges(READ)
+def impossible_steps(root, rng):
+    edit(root, lambda rows: rng.choice(rows).update(steps=int(rng.choice([0, -1, 301, 2**62]))))
+
+
+@forges(READ)
+def an_unknown_stage(root, rng):
+    edit(root, lambda rows: rng.choice(rows).update(stage=rng.choice(["done", "", "<script>"])))
+
+
+@forges(READ)
+def a_success_beside_an_error(root, rng):
+    edit(root, lambda rows: placed(rows, rng).update(error="out of memory"))
+
+
+@forges(READ)
+def a_truncated_file(root, rng):
+    content = (root / EPISODES).read_bytes()
+    (root / EPISODES).write_bytes(content[: int(rng.integers(len(content)))])
+    rehash(root)
+
+
+@forges(READ)
+def noise_in_the_file(root, rng):
+    """As a fuzzer would: many bytes anywhere, and the hash made anew."""
+    content = np.frombuffer((root / EPISODES).read_bytes(), np.uint8).copy()
+    where = rng.integers(len(content) // 2, len(content), size=200)
+    content[where] = rng.integers(256, size=len(where))
+    (root / EPISODES).write_bytes(content.tobytes())
+    rehash(root)
+
+
+@forges(READ)
+def another_column(root, rng):
+    schema = pq.read_schema(root / EPISODES)
+    kind = rng.choice(["more", "less", "wider"])
+    if kind == "more":
+        schema = schema.append(pa.field("score", pa.float64()))
+    elif kind == "less":
+        schema = schema.remove(int(rng.integers(len(schema))))
+    else:
+        schema = schema.set(schema.get_field_index("steps"), pa.field("steps", pa.float64(), nullable=False))
+    edit(root, lambda rows: None, schema)
+
+
+@forges(READ)
+def a_bomb_of_rows(root, rng):
+    edit(root, lambda rows: rows.extend([rows[0]] * 200_000), compression="zstd")
+
+
+@forges(READ)
+def a_bomb_of_actions(root, rng):
+    """Some 50 KB that unpack to 400 MB."""
+    edit(root, lambda rows: rows[0].update(actions=np.zeros(100_000_000, np.float32)), compression="zstd")
+
+
+@forges(READ)
+def a_bomb_of_text(root, rng):
+    edit(root, lambda rows: rows[0].update(error="0" * 500_000_000), compression="zstd")
+
+
+@forges(READ)
+def a_file_too_large(root, rng):
+    os.truncate(root / EPISODES, int(rng.integers(65 << 20, 1 << 40)))  # sparse
+
+
+@forges(READ)
+def many_declared_rows(root, rng):
+    declare(root, lambda said: next(iter(said["settings"].values())).update(episodes=int(rng.integers(10**4, 10**12))))
+
+
+@forges(READ)
+def many_declared_seeds(root, rng):
+    declare(root, lambda said: said.update(training_seeds=list(range(int(rng.integers(300, 3000))))))
+
+
+@forges(READ)
+def a_bomb_of_aliases(root, rng):
+    rows = ["a: &a [x, x, x, x, x, x, x, x, x]"]
+    rows += [f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefgh", "bcdefghi", strict=True)]
+    overwrite(root, "\n".join(rows) + "\n")
+
+
+@forges(READ)
+def a_tag(root, rng):
+    tag = rng.choice(
+        ["!!python/object/apply:os.system [touch /tmp/forged]", "!!python/name:os.system", "!x y", "!!set {}"]
+    )
+    overwrite(root, f"notes: {tag}\n")
+
+
+@forges(READ)
+def yaml_that_is_none(root, rng):
+    text = rng.choice(
+        ["[" * 60_000, "{" * 9000, "\x00", "9" * 9000, "? [a]\n: b", "- a", "", "a: b: c", "\ufeff\ud7ff"]
+    )
+    (root / DECLARATION).write_text(str(text))
+
+
+@forges(READ)
+def a_key_twice(root, rng):
+    overwrite(root, "suite: joints\n")
+
+
+@forges(READ)
+def a_huge_declaration(root, rng):
+    overwrite(root, "# " + "x" * (1 << 17) + "\n")
+
+
+@forges(READ)
+def a_link(root, rng):
+    name = rng.choice([DECLARATION, EPISODES])
+    target = rng.choice(["/etc/passwd", "/dev/zero", "missing"])
+    (root / name).unlink()
+    (root / name).symlink_to(target)
+
+
+@forges(READ)
+def a_pipe(root, rng):
+    (root / EPISODES).unlink()
+    os.mkfifo(root / EPISODES)
+
+
+@forges(READ)
+def another_file(root, rng):
+    (root / rng.choice(["setup.py", "verified.json", ".hidden", "policy.pkl", "é\n名"])).write_text("x")
+
+
+@forges(READ)
+def a_missing_file(root, rng):
+    (root / rng.choice([DECLARATION, EPISODES])).unlink()
+
+
+@forges(READ)
+def a_field_that_is_none(root, rng):
+    declare(root, lambda said: said.update({str(rng.choice(["level", "verified", "__class__"])): "replayed"}))
+
+
+@forges(READ)
+def a_field_of_another_kind(root, rng):
+    name = rng.choice(["about", "settings", "training_seeds", "versions", "suite", "episodes_sha256", "version"])
+    declare(root, lambda said: said.update({name: rng.choice([None, "x", -1.5, True])}))
+
+
+@forges(READ)
+def text_that_hides_text(root, rng):
+    name = rng.choice(["name", "submitter", "revision", "data"])
+    bad = rng.choice(["a\u202eb", "a\nb", "", "\x1b[31mred", "x" * 999, "a\u200bb"])
+    declare(root, lambda said: said["about"].update({name: str(bad)}))
+
+
+@forges(READ)
+def an_address_that_is_a_script(root, rng):
+    url = rng.choice(["javascript:alert(1)", "file:///etc/passwd", "http://x", 'https://x"onclick="y'])
+    declare(root, lambda said: said["about"].update(url=str(url)))
+
+
+# Refused when replayed
+
+
+@forges(REPLAYED)
+def one_outcome(root, rng):
+    field = rng.choice(["placed", "lifted", "lift_step", "place_step", "stage"])
+    other = {"stage": "none", "lift_step": None, "place_step": 1}
+    edit(root, lambda rows: placed(rows, rng).update({field: other.get(field, False)}))
+
+
+@forges(REPLAYED)
+def a_failure_called_success(root, rng):
+    success = {"lifted": True, "placed": True, "stage": "placed", "lift_step": 50, "place_step": 100}
+    edit(root, lambda rows: rng.choice([row for row in rows if not row["placed"]]).update(success))
+
+
+@forges(REPLAYED)
+def actions_of_another_start(root, rng):
+    def change(rows):
+        row = placed(rows, rng)
+        others = [one for one in rows if one["setting"] == row["setting"] and one["placed"] and one is not row]
+        row.update({name: others[0][name] for name in ("actions", "steps", "lift_step")})
+
+    edit(root, change)
+
+
+@forges(REPLAYED)
+def actions_of_another_task(root, rng):
+    def change(rows):
+        row = placed(rows, rng)
+        other = placed([one for one in rows if one["setting"] != row["setting"]], rng)
+        row.update({name: value for name, value in other.items() if name not in ("setting", "evaluation_seed")})
+
+    edit(root, change)
+
+
+@forges(REPLAYED)
+def a_hand_that_opens(root, rng):
+    """Fifteen bits: the gripper's sign while it lifts."""
+
+    def change(rows):
+        row = placed(rows, rng)
+        for step in range(row["lift_step"] - 3, row["lift_step"] + 12):
+            row["actions"][4 * step - 1] = 1.0
+
+    edit(root, change)
+
+
+@forges(REPLAYED)
+def an_end_too_early(root, rng):
+    def change(rows):
+        row = placed(rows, rng)
+        row["steps"] -= int(rng.integers(1, 9))
+        row["actions"] = row["actions"][: 4 * row["steps"]]
+
+    edit(root, change)
+
+
+@forges(REPLAYED)
+def actions_after_the_end(root, rng):
+    def change(rows):
+        row = placed(rows, rng)
+        row["steps"] += 1
+        row["actions"] = [*row["actions"], 0.0, 0.0, 0.0, 1.0]
+
+    edit(root, change)
+
+
+@forges(REPLAYED)
+def an_easier_setting(root, rng):
+    """Played with the task as it is, and called perturbed."""
+    declare(root, lambda said: said["settings"]["brick_to_bin_shifted"].update(perturb="pose=3"))

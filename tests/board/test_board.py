@@ -1,0 +1,132 @@
+"""The board's pages and exports, from the committed entries and from small ones of many seeds."""
+
+import json
+import shutil
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from conftest import ENTRIES
+
+from lerobot_constructskill.board.entries import ranks, read_entries
+from lerobot_constructskill.board.exports import eval_info
+from lerobot_constructskill.board.protocol import SUITES, Setting
+from lerobot_constructskill.board.site import write_board
+from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
+from lerobot_constructskill.errors import InputError, MissingError
+
+BOARD = ENTRIES.parent
+
+
+class Page(HTMLParser):
+    """What a page links to and asks for."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.found = {"id": set(), "href": set(), "src": set()}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        for name, value in attributes:
+            if name in self.found:
+                self.found[name].add(value)
+
+
+@pytest.fixture(scope="module")
+def many(valid, tmp_path_factory):
+    """A board: a policy that places with eight of ten training seeds, one that never does, and one of two seeds."""
+    root = tmp_path_factory.mktemp("many")
+    submission = read_submission(valid)
+    said, (good, bad) = (
+        submission.declaration,
+        (
+            [one for one in submission.claims if one.training_seed == seed and one.setting == "block_to_bin"]
+            for seed in (0, 1)
+        ),
+    )
+    settings = {"block_to_bin": Setting("block_to_bin", episodes=2)}
+    for name, seeds, placing in (("good", 10, 8), ("bad", 10, 0), ("few", 2, 2)):
+        claims = []
+        for seed in range(seeds):
+            for one in good if seed < placing else bad:
+                actions = one.actions.copy()
+                actions[0] += seed * 1e-4
+                claims.append(Claim(**vars(one) | {"training_seed": seed, "actions": actions}))
+        if name == "bad":
+            claims[0] = Claim(claims[0].evaluation_seed, setting="block_to_bin", error="<b>out of memory</b>")
+        about = replace(said.about, name=f"<script>{name}</script>", observes="pixels")
+        told = {"about": about, "backend": said.backend, "versions": said.versions}
+        write_submission(
+            root / "entries" / name, claims, suite="bins", settings=settings, training_seeds=list(range(seeds)), **told
+        )
+    return root
+
+
+def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
+    pages = {path.stem: Page(path.read_text()) for path in write_board(BOARD, tmp_path, "alice/bench")}
+    entries = read_entries(BOARD)
+    assert entries and pages.keys() == {"index", *SUITES}
+    for entry in entries:
+        assert entry.level == "replayed" and entry.said.settings_class == "standard"
+        assert entry.name in pages[entry.said.suite].found["id"]
+        results = yaml.safe_load((tmp_path / "exports" / entry.name / ".eval_results/constructskill.yaml").read_text())
+        assert [one["dataset"]["task_id"] for one in results] == [
+            f"{entry.said.suite}_{one}" for one in entry.standings
+        ]
+    for page in pages.values():
+        links = {link for link in page.found["href"] if not link.startswith(("#", "data:"))}
+        assert not page.found["src"] and all((tmp_path / link).is_file() for link in links)
+        assert {link[1:] for link in page.found["href"] if link.startswith("#")} <= page.found["id"]
+    table = pq.read_table(tmp_path / "board.parquet")
+    assert table.num_rows == sum(len(entry.submission.claims) for entry in entries)
+
+
+def test_ranks_are_of_seeds_and_ties_are_ties(many):
+    entries = read_entries(many)
+    assert ranks(entries, "block_to_bin") == {"good": (1, False), "bad": (2, False)}
+    good = next(entry for entry in entries if entry.name == "good")
+    standing = good.standings["block_to_bin"]
+    assert standing.placed.value == 0.8 and 0 < standing.placed.low < 0.8 < standing.placed.high < 1
+    bad, few = (next(entry for entry in entries if entry.name == name) for name in ("bad", "few"))
+    assert bad.standings["block_to_bin"].errors == 1 and bad.standings["block_to_bin"].placed.value == 0
+    assert few.missing_seeds == 8 and not few.is_ranked
+    twin = replace(good, name="twin")
+    assert ranks([good, twin], "block_to_bin") == {"good": (1, True), "twin": (1, True)}
+
+
+def test_what_a_stranger_writes_is_text(many, tmp_path):
+    write_board(many, tmp_path)
+    text = (tmp_path / "bins.html").read_text()
+    assert "<script" not in text and "&lt;script&gt;good" in text and "1 error" in text and "8 missing" in text
+
+
+def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
+    root = tmp_path / "board"
+    shutil.copytree(many, root)
+    entry = read_entries(root)[0]
+    (root / "verified").mkdir()
+    path = root / "verified" / f"{entry.name}.json"
+    verdict = {"submission": entry.submission.sha256, "level": "replayed", "versions": {"sapien": "3"}}
+    for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
+        path.write_text(json.dumps(said))
+        assert read_entries(root)[0].level == level
+    path.write_text('{"level": "best"}')
+    with pytest.raises(InputError, match="no verdict"):
+        read_entries(root)
+    (root / "entries" / "No Name").mkdir()
+    with pytest.raises(InputError, match="called by a name"):
+        read_entries(root)
+    with pytest.raises(MissingError, match="no board"):
+        read_entries(tmp_path / "nothing")
+
+
+def test_rewards_are_those_of_the_environment():
+    expert = next(entry for entry in read_entries(BOARD) if entry.name == "bins_expert")
+    info = eval_info(expert, 0)
+    assert info["overall"]["n_episodes"] == 101 and info["overall"]["pc_success"] == 100
+    (fixed,) = expert.standings["brick_to_bin"].claims[0]
+    metrics = info["per_task"][0]["metrics"]
+    assert metrics["max_rewards"] == [1.0] and metrics["successes"] == [True]
+    assert metrics["sum_rewards"] == [0.5 * (fixed.steps - fixed.lift_step) + 1.0]

@@ -1,0 +1,66 @@
+"""The commands as a stranger uses them: record, submit, verify, and from fresh starts again."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from commands import call
+
+from lerobot_constructskill.board.protocol import FIRST_FRESH
+from lerobot_constructskill.board.submission import EPISODES
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+SETTINGS = {"shifted": {"task": "brick_to_bin_shifted", "episodes": 2, "episode_length": 3, "first_start": 7}}
+ABOUT = dict.fromkeys(("name", "submitter", "policy", "revision", "data", "training", "compute"), "a test's")
+
+EVALUATE = """
+import os, sys
+import numpy as np
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+root, first = sys.argv[1], int(sys.argv[2])
+env = ConstructSkillEnv("brick_to_bin_shifted", episode_length=3, render_backend="none")
+for seed in (0, 1):
+    os.environ["CONSTRUCTSKILL_RECORD"] = f"{root}/seed_{seed}"
+    rng = np.random.default_rng(seed)
+    for start in (first, first + 1):
+        env.reset(seed=start)
+        for _ in range(3):
+            env.step(rng.uniform(-0.1, 0.1, 4).astype(np.float32))
+env.close()
+"""
+
+
+def evaluate(root: Path, first: int) -> None:
+    """Two training seeds' episodes from two starts, in a process that never renders."""
+    subprocess.run([sys.executable, "-c", EVALUATE, str(root), str(first)], check=True)
+
+
+def test_a_strangers_three_commands_and_a_rerun(tmp_path):
+    (tmp_path / "about.yaml").write_text(yaml.safe_dump(ABOUT | {"observes": "pixels"}))
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(SETTINGS))
+    evaluate(tmp_path / "recorded", 7)
+    flags = ["--suite=bins", f"--about={tmp_path / 'about.yaml'}", f"--settings={tmp_path / 'settings.yaml'}"]
+    entry, again = tmp_path / "entry", tmp_path / "again"
+    said = call("constructskill-submit", *flags, f"--recorded={tmp_path / 'recorded'}", f"--root={entry}")
+    assert "custom, 4 episodes of 2 training seeds" in said
+
+    said = call("constructskill-verify", f"--root={entry}", "--value=beef")
+    first = int(said.partition("fresh starts are ")[2].split()[0])
+    assert first >= FIRST_FRESH and f"--seed={first}" in said and f"first_start: {first}" in said
+    evaluate(tmp_path / "fresh", first)
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump({"shifted": SETTINGS["shifted"] | {"first_start": first}}))
+    call("constructskill-submit", *flags, f"--recorded={tmp_path / 'fresh'}", f"--root={again}")
+    rerun = ["--value=beef", f"--rerun={again}", f"--record={tmp_path / 'verified'}"]
+    said = call("constructskill-verify", f"--root={entry}", *rerun)
+    assert "4 of 4 episodes replayed (12 steps)" in said and "shifted 0% submitted, 0% run anew" in said
+    assert '"level": "re-run"' in (tmp_path / "verified" / "entry.json").read_text()
+    assert "not from the" in call("constructskill-verify", f"--root={entry}", *rerun[1:], "--value=cafe", fails=True)
+
+    content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()
+    content[len(content) // 2] ^= 1
+    (entry / EPISODES).write_bytes(content.tobytes())
+    assert "their hashes differ." in call("constructskill-verify", f"--root={entry}", fails=True)

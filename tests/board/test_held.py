@@ -1,0 +1,60 @@
+"""Determinism, held: committed actions have the outcomes, the states and the pictures that they had when recorded.
+
+An update of SAPIEN, ManiSkill, NumPy, torch or Mesa that changes a bit is seen here; docs/leaderboard.md says what to
+do then. States are compared to a micrometre, as their last bits differ by the kind of CPU; pictures by their hash.
+`python tests/board/test_held.py` records anew.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_constructskill.board.submission import read_submission, width
+from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.recording import Outcome
+
+pytestmark = pytest.mark.sim
+
+RECORDED = Path(__file__).with_name("held.json")
+ENTRY = Path(__file__).parents[2] / "board" / "entries" / "bins_expert"
+TASKS, START = ("brick_to_bin_shifted", "block_to_bin"), 5000
+FRAMES = (1, 40, 80)
+"""Steps after which the pictures are compared: the robot alone, at the object, carrying it."""
+MICROMETRE = 1e-6
+
+
+def execute(task: str) -> tuple[dict, bool]:
+    """What one of the expert's episodes comes to with both cameras, and whether it ends as the entry claims."""
+    submission = read_submission(ENTRY)
+    (claim,) = (one for one in submission.claims if (one.setting, one.evaluation_seed) == (task, START))
+    setting = submission.declaration.settings[task]
+    env = ConstructSkillEnv(task, "pixels_agent_pos", setting.episode_length, render_backend="cpu")
+    env.reset(seed=START)
+    outcome, frames = Outcome(START), {}
+    for step, action in enumerate(claim.actions.reshape(-1, width(setting)), 1):
+        seen, *_, info = env.step(action)
+        outcome.count(info)
+        if step in FRAMES:
+            pictures = [seen["pixels"][name].tobytes() for name in OBS_TYPES["pixels_agent_pos"]]
+            frames[str(step)] = hashlib.sha256(b"".join(pictures)).hexdigest()
+    states = {name: env.privileged_state()[name].tolist() for name in ("object_pose", "tcp_pose", "fingers")}
+    env.close()
+    return {"frames": frames, "states": states}, outcome == claim.outcome
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_nothing_has_changed(task):
+    recorded = json.loads(RECORDED.read_text())[task]
+    found, is_as_claimed = execute(task)
+    assert is_as_claimed, "physics changed: the same actions have another outcome"
+    for name, state in found["states"].items():
+        np.testing.assert_allclose(state, recorded["states"][name], rtol=0, atol=MICROMETRE, err_msg=name)
+    assert found["frames"] == recorded["frames"], "pictures changed: Mesa, SAPIEN or the scene's looks"
+
+
+if __name__ == "__main__":
+    RECORDED.write_text(json.dumps({task: execute(task)[0] for task in TASKS}, indent=1) + "\n")

@@ -1,0 +1,89 @@
+"""The protocol's page says what the protocol is, and its numbers are what they should be."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.board.protocol import (
+    CONTROL,
+    FIRST_FRESH,
+    LEVEL,
+    LEVELS,
+    PERTURBED_TASK,
+    SUITES,
+    TRAINING_SEEDS,
+    Setting,
+    class_of,
+    fresh_settings,
+    fresh_start,
+)
+from lerobot_constructskill.board.submission import OBSERVES, About
+from lerobot_constructskill.contract import DEMO_SEED_START, STAGES
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.perturbations import AXES
+
+PAGE = (Path(__file__).parents[2] / "docs" / "leaderboard.md").read_text()
+
+
+def rows_of_page() -> dict[str, dict[str, tuple[range, int]]]:
+    """Suite to setting to its starts and steps, as the page's table has them."""
+    found, suite = {}, ""
+    for line in PAGE.splitlines():
+        if not (cells := re.fullmatch(r"\| ?(.*?) ?\| (.*) \| (\d+)(?: to (\d+))? \| (\d+) \|", line)):
+            continue
+        suite = cells[1].strip("` |") or suite
+        first, last = int(cells[3]), int(cells[4] or cells[3])
+        names = re.findall("`([a-z0-9_]+)`", cells[2])
+        for name in names[:1] if names[0] == CONTROL else names:
+            found.setdefault(suite, {})[name] = (range(first, last + 1), int(cells[5]))
+    return found
+
+
+def test_the_pages_table_is_the_protocol():
+    assert rows_of_page() == {
+        suite: {name: (one.starts, one.episode_length) for name, one in of.settings.items()}
+        for suite, of in SUITES.items()
+    }
+
+
+def test_the_page_names_the_other_numbers():
+    assert f"Training seeds** are 0 to {TRAINING_SEEDS - 1}." in PAGE
+    assert f"each alone at level {LEVEL}, draw 0" in PAGE and f"`{PERTURBED_TASK}` as it is" in PAGE
+    assert f"({', '.join(STAGES)})" in PAGE
+    assert all(f"| {level} |" in PAGE for level in LEVELS)
+    assert all(f"`{name}`" in PAGE for name in (*About.__dataclass_fields__, *OBSERVES))
+    assert f"{DEMO_SEED_START:,}" in PAGE
+
+
+def test_a_perturbed_setting_has_its_control():
+    settings = SUITES["perturbed"].settings
+    assert settings.keys() == {CONTROL, *AXES}
+    assert {one.perturbation for one in settings.values()} == {"", *(f"+{axis}={LEVEL}+seed=0" for axis in AXES)}
+    assert len({(one.task, one.starts, one.episode_length) for one in settings.values()}) == 1
+
+
+def test_whoever_changes_a_setting_is_custom():
+    settings = SUITES["bins"].settings
+    assert class_of("bins", dict(settings)) == "standard"
+    for changed in (
+        {},
+        {**settings, "more": Setting("brick_to_bin")},
+        {**settings, "block_to_bin": Setting("brick_to_bin")},
+    ):
+        assert class_of("bins", changed) == "custom"
+
+
+@pytest.mark.parametrize("wrong", [{"task": "x"}, {"episodes": 0}, {"perturb": "rain=1"}, {"first_start": 2**31 - 5}])
+def test_what_is_no_setting_is_refused(wrong):
+    with pytest.raises(InputError):
+        Setting(**{"task": "brick_to_bin", **wrong})
+
+
+def test_fresh_starts_follow_from_both_values_and_meet_no_others():
+    drawn = {fresh_start(sha, value) for sha in "ab" * 50 for value in map(str, range(100))}
+    assert len(drawn) == 200 and min(drawn) >= FIRST_FRESH > DEMO_SEED_START
+    assert fresh_start("a", " AB ") == fresh_start("a", "ab")
+    fresh = fresh_settings(SUITES["bins"].settings, max(drawn))
+    assert {one.first_start for one in fresh.values()} == {max(drawn)}
+    assert [one.episodes for one in fresh.values()] == [1, 20, 20]

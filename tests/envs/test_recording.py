@@ -1,0 +1,69 @@
+"""What is recorded is what was executed: a recording, executed again, ends alike, whoever ran it."""
+
+import numpy as np
+import pytest
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.recording import FOLDER, Recording, read_recordings, write_recordings
+from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+from lerobot_constructskill.errors import InputError
+
+DOWN_OPEN = np.array([0.01, 0.02, -0.03, 1], dtype=np.float64)
+
+
+def test_recordings_are_read_as_they_were_written(tmp_path):
+    made = [Recording(7, lifted=True, stage="lifted", lift_step=2, task="brick_to_bin"), Recording(8)]
+    made[0].add(np.float32([0.1, 0, -0.1, 1]), {"is_lifted": True, "is_in_bin": False, "is_success": False})
+    write_recordings(made, tmp_path / "some.parquet")
+    read = read_recordings(tmp_path / "some.parquet")
+    for one, other in zip(made, read, strict=True):
+        np.testing.assert_array_equal(one.flat, other.flat)
+        assert vars(one) | {"actions": 0} == vars(other) | {"actions": 0}
+    (tmp_path / "other.parquet").write_bytes(b"no parquet")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_recordings(tmp_path / "other.parquet")
+
+
+@pytest.mark.sim
+def test_every_finished_episode_is_recorded_and_no_other(tmp_path, monkeypatch):
+    monkeypatch.setenv(FOLDER, str(tmp_path / "kept"))
+    env = ConstructSkillEnv("block_to_bin", episode_length=3, render_backend="none", perturb="pose=1")
+    for seed in (5, 6, 5):
+        env.reset(seed=seed)
+        for _ in range(3):
+            env.step(DOWN_OPEN)
+    env.reset(seed=7)
+    env.step(DOWN_OPEN)
+    env.close()
+    files = sorted((tmp_path / "kept").iterdir())
+    recordings = [recording for path in files for recording in read_recordings(path)]
+    assert [one.evaluation_seed for one in recordings] == [5, 6]
+    for one in recordings:
+        assert (one.task, one.episode_length, one.perturb, one.perturb_seed) == ("block_to_bin", 3, "pose=1", 0)
+        assert (one.steps, one.stage, one.backend.split(",")[0]) == (3, "none", "physx_cpu")
+        np.testing.assert_array_equal(one.flat, np.tile(DOWN_OPEN.astype(np.float32), 3))
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_lerobots_vector_environments_record(use_async_envs, tmp_path, monkeypatch):
+    monkeypatch.setenv(FOLDER, str(tmp_path))
+    config = ConstructSkillEnvConfig(task="block_to_bin", episode_length=2)
+    vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
+    vector.reset(seed=[7, 8], options={"lerobot_new_rollout": True})
+    actions = np.tile([0, 0, 0.01, 1], (2, 1))
+    for _ in range(5):  # a frozen episode goes on returning, and is over
+        vector.step(actions)
+    vector.close()
+    recordings = [recording for path in sorted(tmp_path.iterdir()) for recording in read_recordings(path)]
+    assert [(one.evaluation_seed, one.steps, len(one.flat)) for one in recordings] == [
+        (seed, 2, 2 * len(get_task("block_to_bin").action_names)) for seed in (7, 8)
+    ]
+
+
+def test_what_cannot_be_recorded_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv(FOLDER, str(tmp_path))
+    with pytest.raises(InputError, match="vectorization=process"):
+        NativeVectorEnv(1)
