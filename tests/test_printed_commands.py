@@ -34,6 +34,9 @@ NOT_RUN = {
     "uv venv": "makes an environment with another LeRobot",
     "/tmp/other/": "runs in that environment",
     "examples/smoke_evaluation.sh": "needs the checkout: tests/test_lerobots_evaluation.py",
+    "CONSTRUCTSKILL_RECORD=": "a submission needs every start: tests/board/test_commands.py makes one of two",
+    "constructskill-submit": "of that evaluation",
+    "constructskill-verify": "of that submission",
     "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
     "constructskill-generate outputs/dart_1.yaml": "no demonstration succeeds under the noise of a policy that was "
     "trained for two steps: tests/test_end_to_end.py generates with less of it",
