@@ -14,7 +14,7 @@ PAD = 0.02
 """Width of a finger, across the jaws."""
 
 FINGERS_REACH, HAND_REACH, HAND_HEIGHT = 0.06, 0.105, 0.055
-"""Along the jaws from the TCP: the outside of an open finger, and the hand's own, which starts so far above the TCP."""
+"""Along the jaws from the TCP: an open finger's outside, and the hand's, which starts so far above the TCP."""
 
 TIPPED = np.radians(10)
 """Tilt from which on an object does not stand any more."""
