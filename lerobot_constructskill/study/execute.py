@@ -5,19 +5,17 @@
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
-from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import get_task, held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
@@ -25,15 +23,13 @@ from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
+from lerobot_constructskill.study.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.study.trainers import trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
-
-FACTS = "training.json"
-"""In a checkpoint's folder: what its trainer says of it."""
 
 FILMED_SEED = 0
 
@@ -110,18 +106,11 @@ def _let_through(error: Exception) -> None:
 def _fit(job: Job, runs: Sequence[Run]) -> None:
     arm, training = job.arm, job.arm.training
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(_writing_checkpoint, job.store, run.checkpoint) for run in runs}
+    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
     with timed(job.times, "encoding and training"):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
-
-
-@contextmanager
-def _writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
-    with store.writing(checkpoint) as folder:
-        yield folder
-        (folder / FACTS).write_text(json.dumps(facts) + "\n")
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
@@ -198,12 +187,6 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         backend=backend,
         versions=json.dumps(run.versions | made_of),
     )
-
-
-def read_facts(checkpoint: Path) -> dict:
-    """What a checkpoint says of its training."""
-    file = checkpoint / FACTS
-    return json.loads(file.read_text()) if file.exists() else {}
 
 
 def _dataset_sha256(job: Job) -> str | None:

@@ -8,7 +8,6 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.device_utils import auto_select_torch_device
 
 from lerobot_constructskill.artifacts.digests import distributions_of, versions
 from lerobot_constructskill.artifacts.store import Artifact
@@ -20,15 +19,13 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
+from lerobot_constructskill.study.checkpoints import LEARNING, checkpoint_artifact, decode_policy, settle_policy
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import Study, Training, Variant
-from lerobot_constructskill.study.trainers import packages_of, policy_spec, trainer_of
-
-LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
-"""Packages whose versions may show in any checkpoint."""
+from lerobot_constructskill.study.trainers import packages_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
-"""And in what any agent does."""
+"""Packages whose versions may show in what any agent does."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +82,7 @@ class Run:
         arm = self.arm
         if arm.policy is None:
             return None
-        facts = {"policy": policy_spec(arm.policy), "training": asdict(arm.training), "seed": self.seed}
-        made_by = versions(*LEARNING, *packages_of(arm.policy))
-        made_on = {"demonstrations": arm.demonstrations.artifact.spec, "versions": made_by}
-        return Artifact("checkpoints", facts | made_on)
+        return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec)
 
     @cached_property
     def artifact(self) -> Artifact:
@@ -122,7 +116,7 @@ def list_runs(study: Study) -> list[Run]:
     runs = []
     for name, setting in study.settings.items():
         with _inside(f"settings.{name}.env"):
-            env = _resolve_env(setting.env)
+            env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
         evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
         common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
@@ -138,7 +132,7 @@ def list_runs(study: Study) -> list[Run]:
 
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
-        policy = _settle(variant.policy)
+        policy = settle_policy(variant.policy)
     training = _training_of(study, name, variant)
     return Arm(name=name, role=VARIANT, demonstrations=data, policy=policy, training=training, **common)
 
@@ -151,7 +145,7 @@ def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mappin
     if reference.policy:
         base, variant = _variant_with(study, name, reference)
         with _inside(f"references.{name}"):
-            policy = _settle({**variant.policy, **reference.policy})
+            policy = settle_policy({**variant.policy, **reference.policy})
         return replace(arm, demonstrations=data, policy=policy, training=_training_of(study, base, variant))
     return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
 
@@ -160,7 +154,7 @@ def _variant_with(study: Study, name: str, reference: Reference) -> tuple[str, V
     """The first variant whose policy has the fields that a reference sets otherwise."""
     for of_variant, variant in study.variants.items():
         with _inside(f"variants.{of_variant}.policy"):
-            kind = type(_decode_policy(variant.policy))
+            kind = type(decode_policy(variant.policy))
         if all(hasattr(kind, field) for field in reference.policy):
             return of_variant, variant
     fields = ", ".join(reference.policy)
@@ -172,16 +166,7 @@ def _training_of(study: Study, name: str, variant: Variant) -> Training:
         return decode(Training, {**asdict(study.training), **variant.training})
 
 
-def _settle(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    config = _decode_policy(fields)
-    return trainer_of(config).settle(config)
-
-
-def _decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
-
-
-def _resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
+def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
     env = decode(EnvConfig, {**fields, "type": "constructskill"}).gym_kwargs
     length = env["episode_length"] or get_task(env["task"]).horizon
