@@ -81,25 +81,34 @@ def run_dagger(plan: Plan, store: Store, root: Path, tell: Callable[[Line], None
 
 def _lines(plan: Plan, store: Store) -> Iterator[Line]:
     for number in range(plan.config.rounds + 1):
-        data = obtain_checkpoint(plan, number, store)
+        checkpoint, data = obtain_checkpoint(plan, number, store), obtain_data(plan, number, store)
         evaluated = totals(obtain_evaluation(plan, number, store)) if plan.config.eval_episodes else None
         drives = number < plan.config.rounds
         drove = totals(obtain_round(plan, number + 1, store)[1]) if drives else None
-        error = read_facts(store.folder(plan.checkpoint(number))).get("heldout_mse_m2")
+        error = read_facts(checkpoint).get("heldout_mse_m2")
         yield Line(number, data.num_frames, error, drove, evaluated)
 
 
-def obtain_checkpoint(plan: Plan, number: int, store: Store):
-    """Train policy `number` if it is not there, and return the data set that it is trained on."""
-    made, training, trainer = plan.checkpoint(number), plan.config.training, trainer_of(plan.policy)
-    data = obtain_data(plan, number, store)
+def obtain_checkpoint(plan: Plan, number: int, store: Store) -> Path:
+    """The folder of policy `number`, which is trained if it is not there."""
+    made = plan.checkpoint(number)
     with store.claim([made]) as missing:
         if missing:
-            config, kept_out = deepcopy(plan.policy), held_out(data.num_episodes, training.holdout)
-            writers = {plan.config.seed: partial(writing_checkpoint, store, made)}
-            with trainer.joined(config, data, parts_of(plan, number, store), store):
-                trainer.fit(config, data, writers, training.epochs, training.batch_size, kept_out, store)
-    return data
+            make_checkpoint(plan, number, store)
+    return store.folder(made)
+
+
+def make_checkpoint(plan: Plan, number: int, store: Store) -> None:
+    """Train policy `number`, whose checkpoint the caller has claimed, on rounds that those before it drive."""
+    for past in range(number):
+        obtain_checkpoint(plan, past, store)
+        obtain_round(plan, past + 1, store)
+    config, training, trainer = deepcopy(plan.policy), plan.config.training, trainer_of(plan.policy)
+    data = obtain_data(plan, number, store)
+    kept_out = held_out(data.num_episodes, training.holdout)
+    writers = {plan.config.seed: partial(writing_checkpoint, store, plan.checkpoint(number))}
+    with trainer.joined(config, data, parts_of(plan, number, store), store):
+        trainer.fit(config, data, writers, training.epochs, training.batch_size, kept_out, store)
 
 
 def _copy_data(plan: Plan, store: Store, folder: Path) -> None:

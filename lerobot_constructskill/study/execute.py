@@ -17,6 +17,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import get_task, held_out
+from lerobot_constructskill.dagger.run import make_checkpoint
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
@@ -86,7 +87,8 @@ def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
     trainer, failed = trainer_of(arm.policy), {}
     with job.store.claim([run.checkpoint for run in runs]) as claimed:
         missing = [run for run in runs if run.checkpoint in claimed]
-        for some in [missing] if trainer.seeds_together and missing else [[run] for run in missing]:
+        at_once = trainer.seeds_together and not arm.dagger  # each seed drives its own rounds
+        for some in [missing] if at_once and missing else [[run] for run in missing]:
             try:
                 _fit(job, some)
             except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
@@ -105,6 +107,11 @@ def _let_through(error: Exception) -> None:
 
 def _fit(job: Job, runs: Sequence[Run]) -> None:
     arm, training = job.arm, job.arm.training
+    if arm.dagger:
+        for run in runs:
+            with timed(job.times, "rounds of DAgger"):
+                make_checkpoint(run.dagger, arm.dagger.rounds, job.store)
+        return
     dataset = obtain(job, arm.demonstrations)
     writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
@@ -181,7 +188,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         training_seed=run.seed,
         evaluation_seed=arm.evaluation["seed"],
         episode=0,
-        dataset_sha256=_dataset_sha256(job),
+        dataset_sha256=_dataset_sha256(job, run),
         weights_sha256=weights,
         environment_sha256=digest({"environment": arm.env, "backend": backend}),
         backend=backend,
@@ -189,6 +196,8 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
     )
 
 
-def _dataset_sha256(job: Job) -> str | None:
+def _dataset_sha256(job: Job, run: Run) -> str | None:
     made = job.arm.demonstrations and job.arm.demonstrations.artifact
+    if run.dagger:
+        made = run.dagger.data(job.arm.dagger.rounds)
     return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

@@ -12,6 +12,8 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_constructskill.artifacts.digests import distributions_of, versions
 from lerobot_constructskill.artifacts.store import Artifact
 from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
@@ -52,6 +54,7 @@ class Arm:
         validated_on: all demonstrations of its setting.
         policy: settled configuration of what is trained; None for references that are not.
         training: how.
+        dagger: whose rounds it is trained on beside the demonstrations, if it is.
     """
 
     setting: str
@@ -63,6 +66,7 @@ class Arm:
     validated_on: tuple[Demonstrations, ...] = ()
     policy: PreTrainedConfig | None = None
     training: Training | None = None
+    dagger: DaggerConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +81,18 @@ class Run:
         return f"{self.arm.setting}/{self.arm.name}/seed_{self.seed}"
 
     @cached_property
+    def dagger(self) -> Plan | None:
+        """The rounds that it drives itself."""
+        return Plan(replace(self.arm.dagger, seed=self.seed)) if self.arm.dagger else None
+
+    @cached_property
     def checkpoint(self) -> Artifact | None:
         """What it trains."""
         arm = self.arm
         if arm.policy is None:
             return None
+        if self.dagger:
+            return self.dagger.checkpoint(arm.dagger.rounds)
         return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec)
 
     @cached_property
@@ -125,7 +136,8 @@ def list_runs(study: Study) -> list[Run]:
             arm = _reference_arm(study, reference, own, common)
             runs += [Run(arm, seed) for seed in range(seeds)]
         for variant_name, variant in study.variants_in(name).items():
-            arm = _variant_arm(study, variant_name, variant, sets[variant.data or setting.data], common)
+            data = _read_dagger(variant) if variant.dagger else sets[variant.data or setting.data]
+            arm = _variant_arm(study, variant_name, variant, data, common)
             runs += [Run(arm, seed) for seed in variant.training_seeds]
     return runs
 
@@ -134,7 +146,21 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
     with _inside(f"variants.{name}.policy"):
         policy = settle_policy(variant.policy)
     training = _training_of(study, name, variant)
-    return Arm(name=name, role=VARIANT, demonstrations=data, policy=policy, training=training, **common)
+    learnt = {"demonstrations": data, "policy": policy, "training": training}
+    if variant.dagger:
+        learnt["dagger"] = replace(_dagger_config(variant), policy=variant.policy, training=training)
+    return Arm(name=name, role=VARIANT, **learnt, **common)
+
+
+def _dagger_config(variant: Variant) -> DaggerConfig:
+    with _inside(f"dagger {variant.dagger}"):
+        return parse(DaggerConfig, ["--repo_id=local/any"], find("dagger", variant.dagger))
+
+
+def _read_dagger(variant: Variant) -> Demonstrations:
+    """What a variant's rounds begin with."""
+    plan = Plan(_dagger_config(variant))
+    return Demonstrations(plan.config.base, plan.base)
 
 
 def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
