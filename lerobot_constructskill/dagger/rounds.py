@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -72,10 +72,11 @@ def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[Outcome]:
     made = plan.evaluation(number)
     with store.claim([made]) as missing:
         if missing:
-            outcomes = [Outcome.of(episode) for episode in _drive(plan, number, plan.eval_seeds, 0.0, store)]
+            alone = Drive(number, beta=0.0, patience=plan.env["episode_length"] + 1)  # nobody gives up for it
+            outcomes = [Outcome.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
             with store.writing(made) as folder:
                 folder.mkdir()
-                _save(outcomes, folder / OUTCOMES)
+                _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
     return _read(store.folder(made) / OUTCOMES)
 
 
@@ -84,7 +85,8 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
     finished = {outcome.seed for path in shards.glob(f"*/{OUTCOME}") for outcome in _read(path)}
     seeds = [seed for seed in plan.seeds(number) if seed not in finished]
     features = dagger_features(plan.task, plan.base.obs_type)
-    for episode in _drive(plan, number - 1, seeds, plan.config.beta(number), store):
+    drive = Drive(number, plan.config.beta(number), plan.config.patience)
+    for episode in _drive(plan, number - 1, seeds, drive, store):
         with staged(shards / str(episode.seed)) as shard, room_for(folder):
             shard.mkdir()
             if episode.frames:
@@ -99,13 +101,13 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
     _save(outcomes, folder / OUTCOMES)
 
 
-def _drive(plan: Plan, policy: int, seeds: Iterable[int], beta: float, store: Store) -> Iterable[Episode]:
+def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: Store) -> Iterator[Episode]:
     here = {name: getattr(plan.policy, name) for name in trainer_of(plan.policy).places}
     checkpoint = store.folder(plan.checkpoint(policy))
     learner = PolicyAgent.from_pretrained(checkpoint, plan.policy.device, **here)
     if OBS_STATE in learner.policy.config.input_features and plan.base.obs_type == "pixels":
         raise InputError("The policy reads observation.state; take a base with obs_type 'pixels_agent_pos'.")
-    expert, drive = make_expert(plan.task, plan.base.expert), Drive(policy + 1, beta, plan.config.patience)
+    expert = make_expert(plan.task, plan.base.expert)
     yield from drive_all(learner, expert, plan.env, seeds, drive, plan.config.together, plan.config.workers)
 
 
