@@ -103,7 +103,7 @@ def test_one_command_lists_the_others_and_starts_them() -> None:
     assert front("config", "train/act").stdout == f"{show('train/act')}\n"
     assert front("generate", "fsat").stderr.startswith("constructskill-generate: There is no file and no")
     unknown = front("genrate")
-    assert unknown.returncode == 1 and "'genrate'; there are: card, " in unknown.stderr
+    assert unknown.returncode == 1 and "'genrate'; there are: board, " in unknown.stderr
 
 
 @pytest.fixture(scope="module")

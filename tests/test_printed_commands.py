@@ -37,6 +37,8 @@ NOT_RUN = {
     "CONSTRUCTSKILL_RECORD=": "a submission needs every start: tests/board/test_commands.py makes one of two",
     "constructskill-submit": "of that evaluation",
     "constructskill-verify": "of that submission",
+    "constructskill-dagger": "trains between rounds: tests/dagger/test_dagger.py runs it whole and small",
+    "constructskill-check --root=outputs/driven": "of its set",
     "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
     "constructskill-generate outputs/dart_1.yaml": "no demonstration succeeds under the noise of a policy that was "
     "trained for two steps: tests/test_end_to_end.py generates with less of it",

@@ -8,7 +8,7 @@ from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_valu
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task, held_out
 from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
-from lerobot_constructskill.demos.columns import SIDECAR, demonstration_features
+from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 
 Version = Annotated[str, Pattern(r"[\w.+!-]{1,64}", "a version")]
@@ -27,6 +27,9 @@ MEANINGS = {
     "sim.bin_position": "privileged: centre of the bin's interior, m, world frame",
     "sim.bin_interior": "privileged: the bin's inner edges, m",
     "sim.seed": "seed of the episode's initial state and noise",
+    "dagger.round": "the round in which the frame came about, 0 for demonstrations",
+    "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",
+    "dagger.hopeless": "whether the expert knows no way to success from here; it then opens, rises and waits",
     "next.reward": "stage reached after the action: 0, 0.5 lifted, 1 placed",
     "next.success": "whether the object is placed after the action",
     "next.done": "whether the episode ends with the action",
@@ -50,9 +53,11 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     """
     check_values(Provenance, data.facts, f"{SIDECAR}: ")
     lengths = [span.stop - span.start for span in data.spans()]
-    phases, noise = data.column("phase"), data.column("dart.noise")
+    experts = data.rounds == 0
+    phases, noise = data.column("phase")[experts], data.column("dart.noise")[experts]
     base = data.column("sim.tcp_pose")[0, :3] - data.column("observation.state")[0, :3]
-    return {
+    learners = {"dagger": data.facts["dagger"]} if "dagger" in data.facts else {}
+    return learners | {
         "repo_id": data.config.repo_id,
         "generator": data.facts["generator"],
         "noise_covariance": data.facts["noise_covariance"],
@@ -82,7 +87,8 @@ def card_facts(data: DataSet) -> dict[str, Any]:
 def render(facts: dict[str, Any]) -> str:
     """The card of a data set with these facts, in Markdown with the Hub's front matter."""
     task = get_task(facts["generator"]["task"])
-    features = demonstration_features(task, facts["generator"]["obs_type"])
+    columns = dagger_features if "dagger" in facts else demonstration_features
+    features = columns(task, facts["generator"]["obs_type"])
     cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return markdown.render(

@@ -19,7 +19,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
-from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.dataset.rounds import check_rounds
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import frame_statistics
@@ -52,8 +52,7 @@ def check_files(data: DataSet) -> Iterator[str]:
 
 
 def check_schema(data: DataSet) -> Iterator[str]:
-    task, features = get_task(data.config.task), data.info["features"]
-    wanted = demonstration_features(task, data.config.obs_type)
+    task, features, wanted = get_task(data.config.task), data.info["features"], data.columns
     for name in sorted(wanted.keys() - features.keys()):
         yield f"info.json has no feature {name}."
     for name in sorted(features.keys() - wanted.keys() - BOOKKEEPING):
@@ -77,12 +76,14 @@ def check_values(data: DataSet) -> Iterator[str]:
             finite = np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
             if not finite.all():
                 yield f"{name} is not finite in {(~finite).sum()} frames."
-    limits = {"action": ACTION_SCALE, "dart.executed_action": data.config.noise.clip}
+    experts = data.rounds == 0  # a learner's action is bounded by the environment alone
+    limits = {"action": ACTION_SCALE, "dart.executed_action": np.where(experts, data.config.noise.clip, ACTION_SCALE)}
     for name, limit in limits.items():
-        largest = np.abs(data.column(name)[:, :-1]).max()
-        if largest > limit + 1e-6:
-            yield f"{name} reaches {largest:.4g} where {limit} m a step is the most: these are other units."
-        odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED))
+        largest = np.abs(data.column(name)[:, :-1]).max(axis=1)
+        if (largest > limit + 1e-6).any():
+            most = np.max(limit)
+            yield f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
+        odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED)) & (experts | (name == "action"))
         if odd.any():
             yield f"{name} has a gripper that is neither +1 nor -1 in {odd.sum()} frames."
     state = data.column("observation.state")
@@ -98,6 +99,7 @@ def check_units(data: DataSet) -> Iterator[str]:
     """The arm answers a command in metres and in the base frame: its displacement is a part of it, with its sign."""
     executed, position = data.column("dart.executed_action")[:, :3], data.column("observation.state")[:, :3]
     inner = (np.diff(data.column("episode_index")) == 0) & (np.abs(executed[:-1]).max(axis=1) > 0)
+    inner &= data.rounds[:-1] == 0  # a learner pushes against things
     asked, moved = executed[:-1][inner], np.diff(position, axis=0)[inner]
     strength = np.sqrt((asked**2).mean(axis=0))
     for axis, name in enumerate("xyz"):
@@ -115,16 +117,18 @@ def check_noise(data: DataSet) -> Iterator[str]:
     clean = executed.copy()
     clean[:, :3] -= added
     wanted = clean if config.labels == "clean" else executed
-    if np.abs(data.column("action") - wanted).max() > 1e-6:
+    experts = data.rounds == 0
+    off = np.abs(data.column("action") - wanted)
+    if off[experts].max(initial=0) > 1e-6 or off[:, :3].max() > 1e-6:
         yield f"action is not the {config.labels} action that the provenance says its labels are."
     phases, seeds = data.column("phase"), data.column("sim.seed")
-    drawn = np.empty_like(executed)
-    for span in data.spans():
+    drawn = executed.copy()
+    for span in (span for span in data.spans() if experts[span.start]):
         rng = np.random.default_rng(int(seeds[span.start]))
         for row in range(span.start, span.stop):
             drawn[row] = execute(clean[row], phases[row], config.noise, rng)
     for phase in Phase:
-        rows = phases == phase
+        rows = (phases == phase) & experts
         off = np.abs(drawn - executed)[rows].max(initial=0)
         if off > 1e-6:
             spread = ", ".join(f"{1000 * value:.1f}" for value in added[rows].std(axis=0))
@@ -154,9 +158,13 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
         yield f"{who} has rows {span.start} to {span.stop}, its metadata say otherwise."
     if len(set(data.column("sim.seed")[span])) > 1:
         yield f"{who} has frames of several seeds."
+    done, success = data.column("next.done")[span], data.column("next.success")[span]
+    if data.rounds[span.start] > 0:
+        if done[:-1].any() or success[:-1].any() or not done[-1]:
+            yield f"{who} of a round goes on after its end, or ends before its last frame."
+        return
     if list(dict.fromkeys(data.column("phase")[span])) != list(Phase):
         yield f"{who} does not go through the six phases in order."
-    done, success = data.column("next.done")[span], data.column("next.success")[span]
     if done[:-1].any() or not (done[-1] and success[-1]):
         yield f"{who} does not end in success, or ends before its last frame."
 
@@ -168,12 +176,15 @@ def check_timestamps(data: DataSet) -> Iterator[str]:
 
 
 def check_duplicates(data: DataSet) -> Iterator[str]:
-    """Noisy demonstrations never repeat one another; frames never stand still while a moving arm is told to move."""
+    """Noisy demonstrations never repeat one another; frames never stand still while a moving arm is told to move.
+
+    A learner does repeat itself in a task whose initial state is always the same.
+    """
     if data.config.noise.root.any():
         seen: dict[bytes, int] = {}
         for episode, span in enumerate(data.spans()):
             first = seen.setdefault(data.column("dart.executed_action")[span].tobytes(), episode)
-            if first != episode:
+            if first != episode and data.rounds[span.start] == 0:
                 yield f"Episode {episode} repeats episode {first}."
     state, asked = data.column("observation.state"), np.abs(data.column("dart.executed_action")[:, :3]).max(axis=1)
     still = (np.diff(state, axis=0) == 0).all(axis=1) & (np.diff(data.column("episode_index")) == 0)
@@ -208,8 +219,10 @@ def check_statistics(data: DataSet) -> Iterator[str]:
 
 def check_provenance(data: DataSet) -> Iterator[str]:
     discarded = data.facts["discarded_seeds"]
-    seeds = data.column("sim.seed")[[span.start for span in data.spans()]].tolist()
+    starts = [span.start for span in data.spans()]
+    seeds = data.column("sim.seed")[[start for start in starts if data.rounds[start] == 0]].tolist()
     wanted = list(range(data.config.seed_start, data.config.seed_start + data.facts["attempts"]))
+    yield from check_rounds(data)
     if sorted([*seeds, *discarded]) != wanted:
         yield "The seeds of the episodes and the discarded ones are not those of the attempts, one by one."
     if seeds != sorted(seeds):

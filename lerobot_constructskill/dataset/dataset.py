@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.parsing import decode
@@ -75,6 +76,17 @@ class DataSet:
     def config(self) -> GenerateConfig:
         """The settings it was generated with."""
         return decode(GenerateConfig, self.facts["generator"])
+
+    @cached_property
+    def columns(self) -> dict[str, dict[str, Any]]:
+        """The columns that it should have, those of DAgger among them where it says that a learner drove."""
+        features = dagger_features if "dagger" in self.facts else demonstration_features
+        return features(get_task(self.config.task), self.config.obs_type)
+
+    @cached_property
+    def rounds(self) -> np.ndarray:
+        """The round of DAgger in which each frame came about, (N,); 0 for demonstrations."""
+        return self.column("dagger.round") if "dagger" in self.facts else np.zeros(len(self.rows), dtype=np.int64)
 
     @property
     def cameras(self) -> list[str]:

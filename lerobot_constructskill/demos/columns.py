@@ -8,6 +8,9 @@ from typing import Any
 
 from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, OBS_TYPES, SIM_STATE, STATE_NAMES, Task
 
+ACTORS = EXPERT, LEARNER = "expert", "learner"
+"""Whose action was executed in a frame; the demonstrations' noise is the expert's."""
+
 SIDECAR = "meta/constructskill.json"
 """Where a data set keeps how it was made, relative to its root."""
 
@@ -27,6 +30,15 @@ def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any
         "next.reward": _floats(1),
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+
+
+def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
+    """The columns of `demonstration_features`, and those that say who was at the wheel."""
+    return demonstration_features(task, obs_type) | {
+        "dagger.round": {"dtype": "int64", "shape": (1,), "names": None},
+        "dagger.actor": {"dtype": "string", "shape": (1,), "names": None},
+        "dagger.hopeless": {"dtype": "bool", "shape": (1,), "names": None},
     }
 
 

@@ -42,27 +42,41 @@ def demonstrate(
         if watch:
             watch(phase, obs)
         executed = execute(clean, phase, noise, rng)
-        before = {
-            **{CAMERAS[name].key: image for name, image in obs["pixels"].items()},
-            "observation.state": env.agent_state(),
-            **{f"sim.{name}": value for name, value in sim.items()},
-        }
+        before = seen(obs["pixels"], env.agent_state(), sim)
         obs, reward, success, truncated, _ = env.step(executed)
         is_over = progress is None or truncated or (success and stop_at_success)
         sim = env.privileged_state()
-        frames.append(
-            before
-            | {
-                "action": clean if labels == "clean" else executed,
-                "dart.executed_action": executed,
-                "dart.noise": executed[:3] - clean[:3],
-                "phase": str(phase),
-                "sim.seed": np.array([seed], dtype=np.int64),
-                "next.reward": np.array([reward], dtype=np.float32),
-                "next.success": np.array([success]),
-                "next.done": np.array([is_over]),
-            }
-        )
+        label = clean if labels == "clean" else executed
+        frames.append(before | decided(label, clean, executed, phase, seed) | came_of_it(reward, success, is_over))
     if watch:
         watch(None, obs)
     return frames, success
+
+
+def seen(pixels: dict[str, np.ndarray], agent_state: np.ndarray, sim: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The columns of what is there before a step."""
+    return {
+        **{CAMERAS[name].key: image for name, image in pixels.items()},
+        "observation.state": agent_state,
+        **{f"sim.{name}": value for name, value in sim.items()},
+    }
+
+
+def decided(label: np.ndarray, clean: np.ndarray, executed: np.ndarray, phase: Phase, seed: int) -> dict[str, Any]:
+    """The columns of what the expert says and what is executed."""
+    return {
+        "action": label,
+        "dart.executed_action": executed,
+        "dart.noise": executed[:3] - clean[:3],
+        "phase": str(phase),
+        "sim.seed": np.array([seed], dtype=np.int64),
+    }
+
+
+def came_of_it(reward: float, success: bool, is_over: bool) -> dict[str, Any]:
+    """The columns of what is there after a step."""
+    return {
+        "next.reward": np.array([reward], dtype=np.float32),
+        "next.success": np.array([success]),
+        "next.done": np.array([is_over]),
+    }

@@ -110,12 +110,31 @@ class ExpertConfig:
         check(self, "expert.")
 
 
+@dataclass(frozen=True)
+class Advice:
+    """What an expert would do in a state, however it came about.
+
+    Args:
+        action: (len(task.action_names),) float32, in metres with the gripper last.
+        phase: the phase it belongs to.
+        hopeless: whether no action helps: the object is out of reach, tipped over, or beside a wall where the jaws do
+            not fit. The action is then to open, rise and wait.
+    """
+
+    action: np.ndarray
+    phase: Phase
+    hopeless: bool = False
+
+
 class Expert(Protocol):
     """A scripted controller.
 
     `start` gives the progress before the first action. `act` gives the action, (len(task.action_names),) in
     metres with the gripper last, the phase it belongs to, and the progress after it, or None once the
     demonstration is over.
+
+    `advise` gives the action from the state alone, also in states that the expert never reaches by itself: where
+    somebody else is at the wheel, there is no progress to go by.
     """
 
     def __init__(self, config: ExpertConfig): ...
@@ -123,6 +142,8 @@ class Expert(Protocol):
     def start(self, state: PrivilegedState) -> Progress: ...
 
     def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]: ...
+
+    def advise(self, state: PrivilegedState) -> Advice: ...
 
 
 def make_expert(task: Task, config: ExpertConfig) -> Expert:

@@ -33,8 +33,8 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         )
     roots = [shards / str(attempt.seed) / EPISODE for attempt in attempts if attempt.success]
     with tempfile.TemporaryDirectory(dir=shards) as scratch:
-        _aggregate(config.repo_id, roots, folder, Path(scratch))
-    _write_statistics(folder)
+        aggregate(config.repo_id, roots, folder, Path(scratch))
+    write_statistics(folder)
     task = get_task(config.task)
     (folder / MODALITY).write_text(json.dumps(modality(task, config.obs_type), indent=2) + "\n")
     facts = {
@@ -48,7 +48,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n")
 
 
-def _aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
+def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
     """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
     from lerobot.datasets import aggregate_datasets
 
@@ -61,7 +61,7 @@ def _aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> 
     aggregate_datasets([repo_id] * len(roots), repo_id, roots, folder)
 
 
-def _write_statistics(folder: Path) -> None:
+def write_statistics(folder: Path) -> None:
     """Put the statistics of all frames in place of aggregated ones, and their names in order.
 
     LeRobot averages the quantiles of episodes, which are not the data set's, and lists columns in the order of a set.

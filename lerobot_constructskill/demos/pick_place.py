@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
+from lerobot_constructskill.demos.advice import Memoryless
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress
 
 GRAVITY = 9.81  # m/s2
@@ -29,7 +30,7 @@ GRIPPER = {
 
 
 @dataclass(frozen=True)
-class PickPlaceExpert:
+class PickPlaceExpert(Memoryless):
     """Proportional control toward each phase's target; a phase ends at a distance or after a dwell."""
 
     config: ExpertConfig
@@ -103,6 +104,10 @@ class PickPlaceExpert:
         if misaligned < self.config.align_tolerance or state.tcp[2] < top + AROUND:
             return target
         return np.array([*target[:2], top + ABOVE_TOP])
+
+    def _highest(self, point: np.ndarray) -> float:
+        """Height that the hand reaches over `point`, in metres."""
+        return float(_within_reach(np.array([*point[:2], np.inf]))[2])
 
     def _release_point(self, state: PrivilegedState) -> np.ndarray:
         """Above the bin's centre, the object's underside `release_clearance` above the rim."""

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
+from lerobot_constructskill.demos.advice import Memoryless
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, Progress
 from lerobot_constructskill.demos.pick_place import GRAVITY, GRIPPER, PickPlaceExpert
+from lerobot_constructskill.demos.stance import OPENED, Stance
 
 RELEASE_GAP = 0.003
 """Height in metres over the floor of the receptacle from which an object may drop."""
@@ -25,6 +27,9 @@ fingers, swings between them when it is lifted."""
 DRAWN_IN = 0.00032
 """Translation away from the base asked for per newton of held weight, in m/N: an arm that sags draws the hand in."""
 
+ALIGNED = 0.003
+"""Metres by which closing jaws move the hand."""
+
 ALIGNING_GAIN = 1.2
 """Above 1.5 the held object rocks between the fingers, two steps to a swing."""
 
@@ -37,8 +42,8 @@ FINEST, COARSEST = 0.0008, 0.005
 YAW_STEP, YAW_TOLERANCE = 0.1, 0.03
 """Largest rotation asked for in a step, and the error at which a phase may end, in radians."""
 
-OPENED = 0.036
-"""Position in metres at which a finger no longer holds anything."""
+SEATED = 0.008
+"""Height in metres over the floor of the receptacle at which an object that falls is as good as there."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +98,30 @@ class PreciseExpert(PickPlaceExpert):
         accepted = np.clip(play / 2, FINEST, COARSEST)
         return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
 
+    # Advice
+
+    def _is_there(self, stance: Stance) -> bool:
+        state = stance.state
+        play = (state.bin_interior - state.object_size)[:2] / 2
+        floor = state.bin_position[2] - state.bin_interior[2] / 2
+        off = abs(self._carry_error(state)[:2])
+        return bool(stance.stands and (off < np.maximum(play, COARSEST)).all() and stance.underside < floor + SEATED)
+
+    def _is_at_receptacle(self, stance: Stance) -> bool:
+        """RELEASE aligns above the opening; an object that has come down beside it rises again."""
+        state, error = stance.state, self._carry_error(stance.state)
+        if stance.underside < _rim(state):
+            play = (state.bin_interior - state.object_size)[:2] / 2
+            return bool((abs(error[:2]) < np.maximum(play, COARSEST)).all())
+        return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
+
+    def _release_error(self, stance: Stance) -> np.ndarray:
+        return self._carry_error(stance.state)
+
+    def _is_off_centre(self, stance: Stance) -> bool:
+        error = abs(self._grasp_point(stance.state) - stance.state.tcp)
+        return bool((error > 2 * CENTRED + ALIGNED).any())
+
 
 @dataclass(frozen=True)
 class TurningExpert(PreciseExpert):
@@ -118,6 +147,21 @@ class TurningExpert(PreciseExpert):
             case Phase.LIFT | Phase.CARRY:
                 return _half_turn(-yaw) * (progress.phase is Phase.CARRY)
         return 0.0
+
+    # Advice
+
+    def _skew(self, stance: Stance) -> float:
+        return 0.0
+
+    def _is_there(self, stance: Stance) -> bool:
+        return Memoryless._is_there(self, stance)
+
+    def _is_turned(self, stance: Stance) -> bool:
+        return abs(self._yaw_error(stance.state, self._beginning(Phase.PREGRASP, stance.state))) < YAW_STEP
+
+    def _is_at_receptacle(self, stance: Stance) -> bool:
+        is_turned = abs(self._yaw_error(stance.state, self._beginning(Phase.CARRY, stance.state))) < YAW_STEP
+        return super()._is_at_receptacle(stance) and (is_turned or stance.underside < stance.rim)
 
 
 def _half_turn(angle: float) -> float:

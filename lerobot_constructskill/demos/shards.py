@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.contract import FPS, get_task
+from lerobot_constructskill.contract import FPS, Task, get_task
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import make_expert
@@ -55,7 +55,8 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
         shard.mkdir()
         with room_for(shard):
             if success:
-                _write_episode(config, [frame | {"task": task.instruction} for frame in frames], shard / EPISODE)
+                features = demonstration_features(task, config.obs_type)
+                write_episode(config.repo_id, task, features, frames, shard / EPISODE)
             (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
     return outcome
 
@@ -81,24 +82,30 @@ def _read(path: Path) -> Attempt | None:
         return None
 
 
-def _write_episode(config: GenerateConfig, frames: list[dict], root: Path) -> None:
+def write_episode(repo_id: str, task: Task, features: dict[str, dict], frames: list[dict], root: Path) -> None:
+    """Write a data set of one episode.
+
+    Args:
+        features: its columns, as `columns` lists them.
+        frames: their values, in order.
+    """
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
     os.environ.setdefault("SVT_LOG", "1")
     with quiet():
         dataset = LeRobotDataset.create(
-            repo_id=config.repo_id,
+            repo_id=repo_id,
             root=root,
             fps=FPS,
             robot_type="panda",
-            features=demonstration_features(get_task(config.task), config.obs_type),
+            features=features,
             rgb_encoder=RGBEncoderConfig(crf=18),
             streaming_encoding=True,
             # A demonstration is written at once; a shorter queue would drop frames that the encoder is late for.
-            encoder_queue_maxsize=config.max_steps,
+            encoder_queue_maxsize=max(len(frames), 1),
         )
         for frame in frames:
-            dataset.add_frame(frame)
+            dataset.add_frame(frame | {"task": task.instruction})
         dataset.save_episode()
         dataset.finalize()

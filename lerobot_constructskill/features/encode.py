@@ -1,6 +1,6 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +79,7 @@ def write_feature_set(
     Raises:
         ValueError: the data set has no such camera.
     """
-    info = {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
+    info = _with_source(info, dataset)
     made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
     with room_for(folder):
@@ -87,6 +87,43 @@ def write_feature_set(
         _write_copy(dataset, camera, features, info, repo_id, folder)
         if patches:
             _join_patches(dataset, parts, encoder.spec, folder / PATCHES_FILE)
+
+
+def join_feature_sets(
+    dataset: LeRobotDataset,
+    camera: str,
+    parts: Sequence[LeRobotDataset],
+    info: dict[str, str],
+    repo_id: str,
+    folder: Path,
+    patches: bool = False,
+) -> None:
+    """Write what `write_feature_set` would, from the feature sets of the parts that `dataset` was merged of, in order.
+
+    Raises:
+        ValueError: the parts have other numbers of frames.
+    """
+    key = feature_key(camera)
+    pooled = [np.stack(part.hf_dataset.with_format("numpy")[key][:]) for part in parts]
+    if sum(map(len, pooled)) != dataset.num_frames:
+        raise InputError(f"The parts of '{dataset.repo_id}' have other frames than its {dataset.num_frames}.")
+    with room_for(folder):
+        _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder)
+        if patches:
+            _join_files([part.root / PATCHES_FILE for part in parts], folder / PATCHES_FILE)
+
+
+def _join_files(files: Sequence[Path], joined: Path) -> None:
+    arrays = [np.load(file, mmap_mode="r") for file in files]
+    rows = sum(map(len, arrays))
+    out, first = np.lib.format.open_memmap(joined, "w+", dtype=np.float16, shape=(rows, *arrays[0].shape[1:])), 0
+    for array in arrays:
+        out[first : first + len(array)] = array
+        first += len(array)
+
+
+def _with_source(info: dict[str, str], dataset: LeRobotDataset) -> dict[str, str]:
+    return {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
 
 
 def _encode_frames(

@@ -1,7 +1,7 @@
 """How a study trains frozen_vit: demonstrations through the encoder once, then all seeds together on what came out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +12,10 @@ from lerobot.utils import OBS_STATE
 from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import MissingWeightsError
-from lerobot_constructskill.features.encode import PARTS, load_encoder, write_feature_set
+from lerobot_constructskill.features.encode import PARTS, join_feature_sets, load_encoder, write_feature_set
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import describe
+from lerobot_constructskill.policies.frozen_vit.features import close_patches, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
@@ -36,6 +36,28 @@ class FeatureTrainer:
         spec = get_backbone(config.backbone, config.backbone_path)
         sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
+
+    @contextmanager
+    def joined(
+        self, config: FrozenViTChunkConfig, whole: LeRobotDataset, parts: Sequence[LeRobotDataset], store: Store
+    ) -> Iterator[None]:
+        """Join the parts' features, which are encoded where they are not there, for as long as the block takes."""
+        of_parts = [obtain_features(config, part, store) for part in parts]
+        if len(parts) == 1:
+            yield
+            return
+        made = features_artifact(config, whole)
+        with store.claim([made]) as missing:
+            if missing:
+                info = of_parts[0].meta.features[feature_key(config.camera)]["info"]
+                joined = of_parts, info, f"local/{made.digest}"
+                with store.writing(made) as folder:
+                    join_feature_sets(whole, config.camera, *joined, folder, made.spec["patches"])
+        yield
+        close_patches()
+        with store.claim([made]) as missing:
+            if not missing:
+                store.discard(made)
 
     def fit(
         self,
@@ -82,23 +104,32 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
     Raises:
         FileNotFoundError: no source has the encoder's weights.
     """
+    made = features_artifact(config, demonstrations)
+    repo_id, patches = f"local/{made.digest}", made.spec["patches"]
+    with store.claim([made]) as missing:
+        if missing:
+            eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
+            encoder, info = load_encoder(config.backbone, config.backbone_path, _precision(config), *eyes)
+            with store.writing(made, keep=PARTS) as folder:
+                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, patches=patches)
+    return LeRobotDataset(repo_id, root=store.folder(made))
+
+
+def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset) -> Artifact:
+    """What `obtain_features` returns. Raises as it does."""
     spec, patches = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].reads_patches
     if config.backbone_sha256 is None:
         load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} came while the study ran: start it again.")
-    precision = config.backbone_trained_precision or config.backbone_precision
-    made_by = describe(spec, config.backbone_sha256, precision, config.crop, config.blind)
+    made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
-    made = Artifact("features", {**source, "patches": patches, "encoder": made_by, "versions": made_in})
-    repo_id = f"local/{made.digest}"
-    with store.claim([made]) as missing:
-        if missing:
-            eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
-            encoder, info = load_encoder(config.backbone, config.backbone_path, precision, *eyes)
-            with store.writing(made, keep=PARTS) as folder:
-                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, patches=patches)
-    return LeRobotDataset(repo_id, root=store.folder(made))
+    return Artifact("features", {**source, "patches": patches, "encoder": made_by, "versions": made_in})
+
+
+def _precision(config: FrozenViTChunkConfig) -> str:
+    """What the policy saw in while it was trained, or is to be trained in."""
+    return config.backbone_trained_precision or config.backbone_precision
 
 
 def _backbone_line(config: FrozenViTChunkConfig) -> str:

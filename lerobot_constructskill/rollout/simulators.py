@@ -24,12 +24,14 @@ PRELOADED = [
 
 @dataclass(frozen=True)
 class Step:
-    """What an environment returned from `reset` or `step`, with its privileged state."""
+    """What an environment returned from `reset` or `step`, with its privileged state and its proprioception."""
 
     seen: dict[str, Any]
     sim: dict[str, np.ndarray]
     done: bool
     info: dict[str, Any]
+    reward: float = 0.0
+    agent_state: np.ndarray | None = None
 
 
 class Simulators:
@@ -125,12 +127,12 @@ def _use_one_thread() -> None:
 
 def _reset(env: ConstructSkillEnv, seed: int) -> Step:
     seen, info = env.reset(seed=seed)
-    return Step(seen, env.privileged_state(), False, info)
+    return Step(seen, env.privileged_state(), False, info, 0.0, env.agent_state())
 
 
 def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
-    seen, _, terminated, truncated, info = env.step(action)
-    return Step(seen, env.privileged_state(), terminated or truncated, info)
+    seen, reward, terminated, truncated, info = env.step(action)
+    return Step(seen, env.privileged_state(), terminated or truncated, info, reward, env.agent_state())
 
 
 _VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}

@@ -6,20 +6,19 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
-from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import get_task, held_out
+from lerobot_constructskill.dagger.run import make_checkpoint
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
@@ -27,15 +26,13 @@ from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
+from lerobot_constructskill.study.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.study.trainers import trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
-
-FACTS = "training.json"
-"""In a checkpoint's folder: what its trainer says of it."""
 
 FILMED_SEED = 0
 
@@ -92,7 +89,8 @@ def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
     trainer, failed = trainer_of(arm.policy), {}
     with job.store.claim([run.checkpoint for run in runs]) as claimed:
         missing = [run for run in runs if run.checkpoint in claimed]
-        for some in [missing] if trainer.seeds_together and missing else [[run] for run in missing]:
+        at_once = trainer.seeds_together and not arm.dagger  # each seed drives its own rounds
+        for some in [missing] if at_once and missing else [[run] for run in missing]:
             try:
                 _fit(job, some)
             except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
@@ -111,19 +109,17 @@ def _let_through(error: Exception) -> None:
 
 def _fit(job: Job, runs: Sequence[Run]) -> None:
     arm, training = job.arm, job.arm.training
+    if arm.dagger:
+        for run in runs:
+            with timed(job.times, "rounds of DAgger"):
+                make_checkpoint(run.dagger, arm.dagger.rounds, job.store)
+        return
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(_writing_checkpoint, job.store, run.checkpoint) for run in runs}
+    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
     with timed(job.times, "encoding and training"):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
-
-
-@contextmanager
-def _writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
-    with store.writing(checkpoint) as folder:
-        yield folder
-        (folder / FACTS).write_text(json.dumps(facts) + "\n")
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
@@ -205,7 +201,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         training_seed=run.seed,
         evaluation_seed=arm.evaluation["seed"],
         episode=0,
-        dataset_sha256=_dataset_sha256(job),
+        dataset_sha256=_dataset_sha256(job, run),
         weights_sha256=weights,
         environment_sha256=digest({"environment": arm.env, "backend": backend}),
         backend=backend,
@@ -213,12 +209,8 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
     )
 
 
-def read_facts(checkpoint: Path) -> dict:
-    """What a checkpoint says of its training."""
-    file = checkpoint / FACTS
-    return json.loads(file.read_text()) if file.exists() else {}
-
-
-def _dataset_sha256(job: Job) -> str | None:
+def _dataset_sha256(job: Job, run: Run) -> str | None:
     made = job.arm.demonstrations and job.arm.demonstrations.artifact
+    if run.dagger:
+        made = run.dagger.data(job.arm.dagger.rounds)
     return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

@@ -8,11 +8,12 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
-from lerobot.utils import auto_select_torch_device
 
 from lerobot_constructskill.artifacts.digests import distributions_of, versions
 from lerobot_constructskill.artifacts.store import Artifact
 from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
@@ -20,15 +21,13 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
+from lerobot_constructskill.study.checkpoints import LEARNING, checkpoint_artifact, decode_policy, settle_policy
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import Study, Training, Variant
-from lerobot_constructskill.study.trainers import packages_of, policy_spec, trainer_of
-
-LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
-"""Packages whose versions may show in any checkpoint."""
+from lerobot_constructskill.study.trainers import packages_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
-"""And in what any agent does."""
+"""Packages whose versions may show in what any agent does."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,7 @@ class Arm:
         validated_on: all demonstrations of its setting.
         policy: settled configuration of what is trained; None for references that are not.
         training: how.
+        dagger: whose rounds it is trained on beside the demonstrations, if it is.
     """
 
     setting: str
@@ -66,6 +66,7 @@ class Arm:
     validated_on: tuple[Demonstrations, ...] = ()
     policy: PreTrainedConfig | None = None
     training: Training | None = None
+    dagger: DaggerConfig | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +81,19 @@ class Run:
         return f"{self.arm.setting}/{self.arm.name}/seed_{self.seed}"
 
     @cached_property
+    def dagger(self) -> Plan | None:
+        """The rounds that it drives itself."""
+        return Plan(replace(self.arm.dagger, seed=self.seed)) if self.arm.dagger else None
+
+    @cached_property
     def checkpoint(self) -> Artifact | None:
         """What it trains."""
         arm = self.arm
         if arm.policy is None:
             return None
-        facts = {"policy": policy_spec(arm.policy), "training": asdict(arm.training), "seed": self.seed}
-        made_by = versions(*LEARNING, *packages_of(arm.policy))
-        made_on = {"demonstrations": arm.demonstrations.artifact.spec, "versions": made_by}
-        return Artifact("checkpoints", facts | made_on)
+        if self.dagger:
+            return self.dagger.checkpoint(arm.dagger.rounds)
+        return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec)
 
     @cached_property
     def artifact(self) -> Artifact:
@@ -122,7 +127,7 @@ def list_runs(study: Study) -> list[Run]:
     runs = []
     for name, setting in study.settings.items():
         with _inside(f"settings.{name}.env"):
-            env = _resolve_env(setting.env)
+            env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
         evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
         common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
@@ -131,16 +136,31 @@ def list_runs(study: Study) -> list[Run]:
             arm = _reference_arm(study, reference, own, common)
             runs += [Run(arm, seed) for seed in range(seeds)]
         for variant_name, variant in study.variants_in(name).items():
-            arm = _variant_arm(study, variant_name, variant, sets[variant.data or setting.data], common)
+            data = _read_dagger(variant) if variant.dagger else sets[variant.data or setting.data]
+            arm = _variant_arm(study, variant_name, variant, data, common)
             runs += [Run(arm, seed) for seed in variant.training_seeds]
     return runs
 
 
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
-        policy = _settle(variant.policy)
+        policy = settle_policy(variant.policy)
     training = _training_of(study, name, variant)
-    return Arm(name=name, role=VARIANT, demonstrations=data, policy=policy, training=training, **common)
+    learnt = {"demonstrations": data, "policy": policy, "training": training}
+    if variant.dagger:
+        learnt["dagger"] = replace(_dagger_config(variant), policy=variant.policy, training=training)
+    return Arm(name=name, role=VARIANT, **learnt, **common)
+
+
+def _dagger_config(variant: Variant) -> DaggerConfig:
+    with _inside(f"dagger {variant.dagger}"):
+        return parse(DaggerConfig, ["--repo_id=local/any"], find("dagger", variant.dagger))
+
+
+def _read_dagger(variant: Variant) -> Demonstrations:
+    """What a variant's rounds begin with."""
+    plan = Plan(_dagger_config(variant))
+    return Demonstrations(plan.config.base, plan.base)
 
 
 def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
@@ -151,7 +171,7 @@ def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mappin
     if reference.policy:
         base, variant = _variant_with(study, name, reference)
         with _inside(f"references.{name}"):
-            policy = _settle({**variant.policy, **reference.policy})
+            policy = settle_policy({**variant.policy, **reference.policy})
         return replace(arm, demonstrations=data, policy=policy, training=_training_of(study, base, variant))
     return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
 
@@ -160,7 +180,7 @@ def _variant_with(study: Study, name: str, reference: Reference) -> tuple[str, V
     """The first variant whose policy has the fields that a reference sets otherwise."""
     for of_variant, variant in study.variants.items():
         with _inside(f"variants.{of_variant}.policy"):
-            kind = type(_decode_policy(variant.policy))
+            kind = type(decode_policy(variant.policy))
         if all(hasattr(kind, field) for field in reference.policy):
             return of_variant, variant
     fields = ", ".join(reference.policy)
@@ -172,16 +192,7 @@ def _training_of(study: Study, name: str, variant: Variant) -> Training:
         return decode(Training, {**asdict(study.training), **variant.training})
 
 
-def _settle(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    config = _decode_policy(fields)
-    return trainer_of(config).settle(config)
-
-
-def _decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
-
-
-def _resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
+def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
     env = decode(EnvConfig, {**fields, "type": "constructskill"}).gym_kwargs
     length = env["episode_length"] or get_task(env["task"]).horizon

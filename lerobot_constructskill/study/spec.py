@@ -34,6 +34,8 @@ class Variant:
         policy: fields of a LeRobot policy, `type` among them.
         seeds: how many training seeds, `first_seed` and those that follow it.
         data: other demonstrations than the setting's, for an ablation of the data.
+        dagger: what `constructskill-dagger` takes, a name or file: each seed is trained on rounds that it drives
+            itself. Its demonstrations and rounds count; policy, training and seed are the variant's.
         settings: names of the settings it runs in; all of them by default.
         training: fields of `Training` that differ from the study's.
         first_seed: seeds that something is chosen on are not those that are reported (0 and up).
@@ -42,6 +44,7 @@ class Variant:
     policy: dict[str, Any]
     seeds: Count = 10
     data: str | None = None
+    dagger: str | None = None
     settings: list[str] | None = None
     training: dict[str, Any] = field(default_factory=dict)
     first_seed: Seed = 0
@@ -116,6 +119,8 @@ class Study:
             if unknown:
                 known = ", ".join(self.settings)
                 raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; there are: {known}.")
+            if variant.dagger and variant.data:
+                raise InputError(f"Variant '{name}' has data, and dagger, which brings its own; name one of them.")
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
 

@@ -4,8 +4,8 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,16 @@ class Trainer:
     def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:
         """Return the configuration with everything written out that it leaves to the machine."""
         return config
+
+    @contextmanager
+    def joined(
+        self, config: PreTrainedConfig, whole: LeRobotDataset, parts: Sequence[LeRobotDataset], store: Store
+    ) -> Iterator[None]:
+        """Have ready for the block whatever `fit` computes of every frame of `whole`, which is its parts in order.
+
+        What was computed of a part once is not computed again.
+        """
+        yield
 
     def fit(
         self,

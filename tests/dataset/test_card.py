@@ -17,7 +17,7 @@ from lerobot_constructskill.contract import CAMERAS, FPS, TASKS
 from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos import shards
-from lerobot_constructskill.demos.columns import demonstration_features
+from lerobot_constructskill.demos.columns import dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import modality
 from lerobot_constructskill.demos.settings import GenerateConfig
@@ -38,7 +38,7 @@ def card(data):
 
 def test_every_column_of_every_task_has_its_meaning():
     for task in TASKS.values():
-        features = demonstration_features(task, "pixels_agent_pos")
+        features = dagger_features(task, "pixels_agent_pos")
         assert set(features) - {camera.key for camera in CAMERAS.values()} == set(MEANINGS)
 
 

@@ -42,6 +42,11 @@ def open_patches(root: Path) -> Tensor:
     return _mapped(file)
 
 
+def close_patches() -> None:
+    """Let go of what `open_patches` has mapped: a removed file takes its room until then."""
+    _mapped.cache_clear()
+
+
 @cache
 def _mapped(file: Path) -> Tensor:
     return torch.from_numpy(np.load(file, mmap_mode="c"))  # torch takes no read-only memory

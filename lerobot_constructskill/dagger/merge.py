@@ -1,0 +1,90 @@
+"""Demonstrations and rounds into one LeRobotDataset, which says of every frame who acted, and of itself who drove."""
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset, modify_features
+
+from lerobot_constructskill.artifacts.digests import file_sha256
+from lerobot_constructskill.artifacts.disk import room_for
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.rounds import obtain_round, totals
+from lerobot_constructskill.demos.columns import EXPERT, SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.demos.merge import aggregate, write_statistics
+from lerobot_constructskill.demos.modality import MODALITY, modality
+from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.progress import quiet
+
+
+def parts_of(plan: Plan, number: int, store: Store) -> list[LeRobotDataset]:
+    """The demonstrations and the first `number` rounds, each made if it is not there."""
+    rounds = [obtain_round(plan, past, store)[0] for past in range(1, number + 1)]
+    return [obtain_demonstrations(plan.base, store), *rounds]
+
+
+def obtain_data(plan: Plan, number: int, store: Store) -> LeRobotDataset:
+    """What policy `number` is trained on."""
+    parts = parts_of(plan, number, store)
+    if number == 0:
+        return parts[0]
+    made = plan.data(number)
+    repo_id = f"local/{made.digest}"
+    with store.claim([made]) as missing:
+        if missing:
+            with store.writing(made) as folder, room_for(folder), quiet():
+                _merge(plan, parts, repo_id, folder, store)
+    return LeRobotDataset(repo_id, root=store.folder(made))
+
+
+def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, store: Store) -> None:
+    base, *rounds = parts
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        first = Path(scratch) / "demonstrations"
+        _add_columns(plan, base, first)
+        aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))
+    write_statistics(folder)
+    (folder / MODALITY).write_text(json.dumps(modality(plan.task, plan.base.obs_type), indent=2) + "\n")
+    facts = json.loads((base.root / SIDECAR).read_text())
+    facts["dagger"] = {
+        "policy": plan.checkpoint(0).spec["policy"],
+        "training_seed": plan.config.seed,
+        "demonstrations": base.num_episodes,
+        "rounds": [_provenance(plan, number, store) for number in range(1, len(parts))],
+    }
+    write_sidecar(folder, facts)
+
+
+def write_sidecar(folder: Path, facts: dict[str, Any]) -> None:
+    """Write how a data set was made, with the hashes of its files as they are."""
+    (folder / SIDECAR).write_text(json.dumps(facts | {"sha256": file_hashes(folder)}, indent=2) + "\n")
+
+
+def _add_columns(plan: Plan, base: LeRobotDataset, folder: Path) -> None:
+    columns, frames = dagger_features(plan.task, plan.base.obs_type), base.num_frames
+    values = {
+        "dagger.round": np.zeros((frames, 1), dtype=np.int64),
+        "dagger.actor": np.full((frames, 1), EXPERT, dtype=object),
+        "dagger.hopeless": np.zeros((frames, 1), dtype=bool),
+    }
+    added = columns.keys() - demonstration_features(plan.task, plan.base.obs_type).keys()
+    modify_features(base, {name: (values[name], columns[name]) for name in sorted(added)}, None, folder, base.repo_id)
+
+
+def _provenance(plan: Plan, number: int, store: Store) -> dict[str, Any]:
+    """Who drove in a round, and how."""
+    _, outcomes = obtain_round(plan, number, store)
+    weights = store.folder(plan.checkpoint(number - 1)) / "model.safetensors"
+    return {
+        "round": number,
+        "beta": plan.config.beta(number),
+        "policy_sha256": file_sha256(weights) if weights.exists() else None,
+        "checkpoint": plan.checkpoint(number - 1).digest,
+        "seed_start": plan.seeds(number).start,
+        "patience": plan.config.patience,
+        **totals(outcomes),
+    }

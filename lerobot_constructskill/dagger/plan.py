@@ -1,0 +1,117 @@
+"""A DAgger run before anything runs: every policy, round and data set of it, each found by what makes it."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_constructskill.artifacts.digests import versions
+from lerobot_constructskill.artifacts.store import Artifact
+from lerobot_constructskill.contract import Task, get_task
+from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.demos.obtain import artifact
+from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.envs.gym_env import resolve_rendering
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.parsing import parse
+from lerobot_constructskill.presets import find
+from lerobot_constructskill.study.checkpoints import LEARNING, checkpoint_artifact, settle_policy
+from lerobot_constructskill.study.trainers import packages_of
+
+ACTING = (*LEARNING, "mani_skill", "sapien", "av")
+"""Packages whose versions may show in a round's frames, beside the policy's own."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a configuration asks for. Policy 0 learns from the demonstrations, policy k from those of k rounds too.
+
+    Raises:
+        InputError: the base cannot be read, its labels are not the expert's, or nothing can be a policy.
+    """
+
+    config: DaggerConfig
+
+    @cached_property
+    def base(self) -> GenerateConfig:
+        flags = ["--repo_id=local/any", f"--workers={self.config.workers}"]
+        if self.config.base_episodes:
+            flags.append(f"--episodes={self.config.base_episodes}")
+        base = parse(GenerateConfig, flags, find("generate", self.config.base))
+        if base.labels != "clean":
+            raise InputError(f"The base '{self.config.base}' has executed actions for labels; DAgger's are clean.")
+        return base
+
+    @cached_property
+    def policy(self) -> PreTrainedConfig:
+        return settle_policy(self.config.policy)
+
+    @property
+    def task(self) -> Task:
+        return get_task(self.base.task)
+
+    @cached_property
+    def env(self) -> dict[str, Any]:
+        """Keywords of `ConstructSkillEnv` in every round, what they leave to the machine written out."""
+        light_robot, backend = resolve_rendering(self.base.light_robot)
+        length = self.config.max_steps or self.task.horizon
+        return {
+            "task": self.base.task,
+            "obs_type": self.base.obs_type,
+            "episode_length": length,
+            "light_robot": light_robot,
+            "render_backend": backend,
+        }
+
+    @cached_property
+    def demonstrations(self) -> Artifact:
+        return artifact(self.base)
+
+    def data(self, number: int) -> Artifact:
+        """The demonstrations and the first `number` rounds."""
+        if number == 0:
+            return self.demonstrations
+        rounds = [self.round(past).digest for past in range(1, number + 1)]
+        return Artifact("dagger", {"demonstrations": self.demonstrations.digest, "rounds": rounds})
+
+    def checkpoint(self, number: int) -> Artifact:
+        """Policy `number`."""
+        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, self.data(number).spec)
+
+    def round(self, number: int) -> Artifact:
+        """The frames of a round, counted from 1, in which policy `number - 1` drives."""
+        facts = {
+            "number": number,
+            "learner": self.checkpoint(number - 1).digest,
+            "beta": self.config.beta(number),
+            "seeds": [self.seeds(number).start, self.config.episodes],
+            "expert": vars(self.base.expert),
+            "environment": self.env,
+            "patience": self.config.patience,
+        }
+        return Artifact("rounds", facts | {"versions": self._versions})
+
+    def evaluation(self, number: int) -> Artifact:
+        """How policy `number` does by itself."""
+        seeds = [self.config.eval_seed, self.config.eval_episodes]
+        facts = {"learner": self.checkpoint(number).digest, "seeds": seeds, "environment": self.env}
+        return Artifact("evaluations", facts | {"versions": self._versions})
+
+    def seeds(self, number: int) -> range:
+        """Those of a round."""
+        first = self.config.seed_start + (number - 1) * self.config.episodes
+        return range(first, first + self.config.episodes)
+
+    @property
+    def eval_seeds(self) -> range:
+        return range(self.config.eval_seed, self.config.eval_seed + self.config.eval_episodes)
+
+    @cached_property
+    def _versions(self) -> dict[str, str]:
+        return versions(*ACTING, *packages_of(self.policy))
+
+
+def named(config: DaggerConfig, **changes: Any) -> Plan:
+    """The plan of a configuration with some fields otherwise, such as another training seed."""
+    return Plan(replace(config, **changes))

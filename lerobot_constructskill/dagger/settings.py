@@ -1,0 +1,73 @@
+"""The fields of `constructskill-dagger`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from lerobot_constructskill.bounds import Count, NotEmpty, Range, RepoId, Seed, Steps, Text, Workers, check
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study.spec import Training
+
+Beta = Annotated[float, Range(0, 1)]
+
+ROUND_SEED_START = 2_000_000
+"""Seed of the first episode of the first round; a data set's demonstrations start at `contract.DEMO_SEED_START`."""
+
+
+@dataclass(frozen=True)
+class DaggerConfig:
+    """A policy is trained on demonstrations; in each round it drives, the expert labels every state that it comes to,
+    these frames are added, and it is trained anew on all of them.
+
+    Args:
+        repo_id: the data set's name, `user/name`.
+        policy: fields of a LeRobot policy, `type` among them.
+        root: folder to write: `dataset`, `checkpoint` and `rounds.json`; `outputs/dagger/<name>` by default.
+        store: where all that is made on the way lies, each thing once for all commands.
+        base: the demonstrations to begin with: a name or file that `constructskill-generate` takes.
+        base_episodes: so many of them, in place of what `base` says.
+        training: how the policy is trained, each time from the start.
+        seed: training seed.
+        rounds: how often the policy drives; with 0 it is behaviour cloning.
+        episodes: episodes a round.
+        max_steps: steps after which an episode ends without success; the task's horizon by default.
+        betas: with which probability the expert's action is executed in a step and not the policy's, for each round;
+            the last one is also that of the rounds which follow. The label is the expert's in every step.
+        seed_start: seed of the first episode; they count up through all rounds.
+        patience: an episode ends after so many steps in a row in which the expert knows no way to success.
+        eval_episodes: episodes in which every policy is evaluated beside the rounds, the same for all.
+        eval_seed: seed of the first of them.
+        workers: processes that simulate.
+        together: episodes that run at the same time.
+
+    Raises:
+        ValueError: a field holds what its annotation does not allow, or the policy has no type.
+    """
+
+    repo_id: RepoId
+    policy: dict[str, Any]
+    root: Text | None = None
+    store: Path = Path("outputs/store")
+    base: str = "fast_shifted_wrist"
+    base_episodes: Count | None = None
+    training: Training = field(default_factory=Training)
+    seed: Seed = 0
+    rounds: Annotated[int, Range(0, 1000)] = 3
+    episodes: Count = 16
+    max_steps: Steps | None = None
+    betas: Annotated[list[Beta], NotEmpty()] = field(default_factory=lambda: [0.0])
+    seed_start: Seed = ROUND_SEED_START
+    patience: Steps = 20
+    eval_episodes: Annotated[int, Range(0, 100_000)] = 0
+    eval_seed: Seed = 1000
+    workers: Workers = 2
+    together: Count = 8
+
+    def __post_init__(self):
+        check(self)
+        if "type" not in self.policy:
+            raise InputError("policy must name its type, such as 'type: frozen_vit'.")
+
+    def beta(self, number: int) -> float:
+        """That of a round, counted from 1."""
+        return self.betas[min(number, len(self.betas)) - 1]

@@ -1,0 +1,140 @@
+"""Many episodes in lockstep with a learner at the wheel, and the expert beside it, who says what it would do."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED, GRIPPER_OPEN, get_task
+from lerobot_constructskill.demos.columns import EXPERT, LEARNER
+from lerobot_constructskill.demos.demonstrate import came_of_it, decided, seen
+from lerobot_constructskill.demos.expert import Advice, Expert, PrivilegedState
+from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent
+from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How episodes are driven.
+
+    Args:
+        number: the round's, for its frames.
+        beta: probability of the expert's action in a step.
+        patience: hopeless steps in a row after which an episode ends; they are dropped.
+    """
+
+    number: int
+    beta: float
+    patience: int
+
+
+@dataclass
+class Episode:
+    """One of a round: its frames, in the columns of `columns.dagger_features`, and whether the object was placed."""
+
+    seed: int
+    now: Step
+    rng: np.random.Generator
+    frames: list[dict[str, Any]] = field(default_factory=list)
+    placed: bool = False
+    hopeless: int = 0
+
+    def choose(self, advice: Advice, proposed: np.ndarray, drive: Drive) -> np.ndarray:
+        """The action of this step; the frame that it makes is kept with its label."""
+        expert = self.rng.random() < drive.beta
+        executed = advice.action if expert else as_executed(proposed)
+        self.hopeless = self.hopeless + 1 if advice.hopeless else 0
+        self.frames.append(
+            seen(self.now.seen["pixels"], self.now.agent_state, self.now.sim)
+            | decided(advice.action, advice.action, executed, advice.phase, self.seed)
+            | {
+                "dagger.round": np.array([drive.number], dtype=np.int64),
+                "dagger.actor": EXPERT if expert else LEARNER,
+                "dagger.hopeless": np.array([advice.hopeless]),
+            }
+        )
+        return executed
+
+    def add(self, step: Step, drive: Drive) -> bool:
+        """Keep what came of the step, and return whether the episode is over."""
+        self.now, self.placed = step, self.placed or step.info["is_success"]
+        self.frames[-1] |= came_of_it(step.reward, step.info["is_success"], step.done)
+        if self.hopeless < drive.patience:
+            return step.done
+        del self.frames[-self.hopeless :]
+        if self.frames:
+            self.frames[-1]["next.done"] = np.array([True])
+        return True
+
+
+def as_executed(action: np.ndarray) -> np.ndarray:
+    """What the environment makes of an action: within its bounds."""
+    high = np.full(len(action), ACTION_SCALE, dtype=np.float32)
+    high[-1] = GRIPPER_OPEN
+    low = -high
+    low[-1] = GRIPPER_CLOSED
+    return np.clip(np.asarray(action, dtype=np.float32), low, high)
+
+
+def drive_all(
+    learner: Agent,
+    expert: Expert,
+    env_kwargs: Mapping[str, Any],
+    seeds: Sequence[int],
+    drive: Drive,
+    together: int,
+    n_workers: int | None = None,
+) -> Iterator[Episode]:
+    """Yield an episode of each seed as soon as it is over; what it holds does not depend on those beside it.
+
+    Args:
+        together: episodes at a time, each with a copy of the learner.
+        n_workers: simulator processes; one per core by default.
+
+    Raises:
+        OSError: a simulator's process died.
+        Exception: whatever the learner or an environment raises.
+    """
+    if not (seeds := list(seeds)):
+        return
+    agents = copies(learner, min(together, len(seeds)))
+    instruction = get_task(env_kwargs["task"]).instruction
+    with simulators(len(agents), env_kwargs, n_workers) as sims, Progress(unit="step", desc="driving") as bar:
+        lockstep, running = Lockstep(agents), {}
+        while seeds or running:
+            free = [lane for lane in range(len(agents)) if lane not in running][: len(seeds)]
+            running |= _start({lane: seeds.pop(0) for lane in free}, agents, sims)
+            observations = {lane: Observation(e.now.seen, e.now.sim, instruction) for lane, e in running.items()}
+            proposed = _unwrap(lockstep.act(observations))
+            advice = {lane: expert.advise(PrivilegedState(**e.now.sim)) for lane, e in running.items()}
+            executed = {lane: e.choose(advice[lane], proposed[lane], drive) for lane, e in running.items()}
+            bar.update(len(running))
+            for lane, step in _unwrap(sims.step(executed)).items():
+                if running[lane].add(step, drive):
+                    yield running.pop(lane)
+
+
+def copies(learner: Agent, count: int) -> list[Agent]:
+    """Agents that act alike and remember on their own; policies share their weights."""
+    if not isinstance(learner, PolicyAgent):
+        return [learner, *(deepcopy(learner) for _ in range(count - 1))]
+    shared = {id(child): child for child in learner.policy.children()}
+    policies = [learner.policy, *(deepcopy(learner.policy, dict(shared)) for _ in range(count - 1))]
+    return [PolicyAgent(policy, learner.preprocessor, learner.postprocessor) for policy in policies]
+
+
+def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, Episode]:
+    for lane, seed in seeds.items():
+        agents[lane].reset(seed)
+    steps = _unwrap(sims.reset(seeds))
+    return {lane: Episode(seed, steps[lane], np.random.default_rng([seed, 1])) for lane, seed in seeds.items()}
+
+
+def _unwrap(results: Mapping[int, Any]) -> Mapping[int, Any]:
+    for result in results.values():
+        if isinstance(result, Exception):
+            raise result
+    return results

@@ -1,0 +1,37 @@
+"""`constructskill-dagger`: a learner drives, the expert labels, and the policy is trained on both."""
+
+from pathlib import Path
+
+from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.scripts.console import run
+
+
+def dagger(config: DaggerConfig) -> str:
+    """Run DAgger, print a line for each policy, and return where the data set and the checkpoint are.
+
+    Raises:
+        FileExistsError: the root exists already, or another process is writing it.
+        ValueError: nothing can be made of a field.
+        OSError: the disk is full, this machine cannot render, or a process died.
+    """
+    import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
+
+    register_third_party_plugins()
+    from lerobot_constructskill.artifacts.store import Store
+    from lerobot_constructskill.dagger.plan import Plan
+    from lerobot_constructskill.dagger.run import run_dagger
+
+    root = Path(config.root) if config.root else Path("outputs/dagger") / config.repo_id.split("/")[1]
+    lines = run_dagger(
+        Plan(config), Store(config.store.absolute()), root.absolute(), lambda line: print(line, flush=True)
+    )
+    return f"{len(lines)} policies, {lines[-1].frames} frames: {root}/dataset, {root}/checkpoint"
+
+
+def main() -> None:
+    run(DaggerConfig, dagger, presets="dagger")
+
+
+if __name__ == "__main__":
+    main()

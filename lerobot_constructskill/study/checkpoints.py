@@ -1,0 +1,57 @@
+"""Checkpoints in a store: a policy's fields settled, what a checkpoint is found by, and what it says of its making."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+from lerobot.utils import auto_select_torch_device
+
+from lerobot_constructskill.artifacts.digests import versions
+from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.parsing import decode
+from lerobot_constructskill.study.spec import Training
+from lerobot_constructskill.study.trainers import packages_of, policy_spec, trainer_of
+
+LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
+"""Packages whose versions may show in any checkpoint."""
+
+FACTS = "training.json"
+"""In a checkpoint's folder: what its trainer says of it."""
+
+
+def decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
+    """The configuration of these fields, `type` among them."""
+    return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
+
+
+def settle_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
+    """The same with everything written out that it leaves to the machine."""
+    config = decode_policy(fields)
+    return trainer_of(config).settle(config)
+
+
+def checkpoint_artifact(
+    policy: PreTrainedConfig, training: Training, seed: int, demonstrations: Mapping[str, Any]
+) -> Artifact:
+    """What a training seed of a settled policy makes of demonstrations with this specification."""
+    facts = {"policy": policy_spec(policy), "training": asdict(training), "seed": seed}
+    made_by = versions(*LEARNING, *packages_of(policy))
+    return Artifact("checkpoints", facts | {"demonstrations": demonstrations, "versions": made_by})
+
+
+@contextmanager
+def writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
+    """A `trainers.Writer`, but for its first two arguments."""
+    with store.writing(checkpoint) as folder:
+        yield folder
+        (folder / FACTS).write_text(json.dumps(facts) + "\n")
+
+
+def read_facts(checkpoint: Path) -> dict:
+    """What a checkpoint says of its training."""
+    file = checkpoint / FACTS
+    return json.loads(file.read_text()) if file.exists() else {}

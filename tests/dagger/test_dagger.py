@@ -1,0 +1,131 @@
+"""DAgger as a user runs it: killed on the way it ends in the same bytes, and its data set is one like any other."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import get_policy_class
+
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.dagger.merge import obtain_data, parts_of
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.dataset.card import card_facts, render
+from lerobot_constructskill.dataset.checks import CHECKS, complaints
+from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.features.trainer import FeatureTrainer, features_artifact, obtain_features
+from lerobot_constructskill.parsing import parse
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+EPISODES, ROUNDS = 2, 2
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory, tiny_weights):
+    """A configuration file: two demonstrations, two rounds of two short episodes, a policy of random weights."""
+    policy = {"type": "frozen_vit", "backbone": "vit_tiny16", "backbone_path": str(tiny_weights)}
+    fields = {
+        "base": "smoke",
+        "policy": policy | {"readout": "spatial_softmax"},
+        "training": {"epochs": 1, "batch_size": 64, "holdout": 2},
+        "rounds": ROUNDS,
+        "episodes": EPISODES,
+        "betas": [0.5, 0.0],
+        "max_steps": 15,
+        "eval_episodes": 1,
+    }
+    file = tmp_path_factory.mktemp("dagger") / "tiny.yaml"
+    file.write_text(yaml.safe_dump(fields))
+    return file
+
+
+@pytest.fixture(scope="module")
+def made(settings):
+    """The command's root and what it said; the store beside it."""
+    root = settings.parent / "whole"
+    return root, finish(start(settings, root, settings.parent / "store"))
+
+
+def start(settings, root, store, *flags):
+    command = [sys.executable, "-m", "lerobot_constructskill.scripts.dagger", str(settings), "--repo_id=local/driven"]
+    flags = [f"--root={root}", f"--store={store}", *flags]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*command, *flags], start_new_session=True, **pipes)
+
+
+def finish(process):
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    return out
+
+
+def test_the_command_tells_of_every_policy_and_leaves_a_set_that_passes_every_check(made):
+    root, said = made
+    lines = json.loads((root / "rounds.json").read_text())
+    assert len(lines) == ROUNDS + 1 and all(f"policy {number}:" in said for number in range(ROUNDS + 1))
+    data = open_dataset(root / "dataset")
+    assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
+    assert lines[-1]["frames"] == len(data.rows) == lines[0]["frames"] + 15 * EPISODES * ROUNDS
+    by_expert = [entry["by_expert"] for entry in data.facts["dagger"]["rounds"]]
+    assert 0 < by_expert[0] < 15 * EPISODES and by_expert[1] == 0
+    assert "probability of the expert's hand" in render(card_facts(data) | {"repo_id": "local/driven"})
+
+
+def test_lerobot_reads_the_set_and_the_checkpoint(made):
+    root, _ = made
+    dataset = LeRobotDataset("local/driven", root=root / "dataset")
+    frame = dataset[dataset.num_frames - 1]
+    assert int(frame["dagger.round"]) == ROUNDS and frame["dagger.actor"] == "learner"
+    assert get_policy_class("frozen_vit").from_pretrained(root / "checkpoint").config.readout == "spatial_softmax"
+
+
+@pytest.mark.parametrize("damage", ["rounds", "actor", "label"])
+def test_the_checks_see_what_is_not_as_it_is_said_to_be(made, damage):
+    data = open_dataset(made[0] / "dataset")
+    driven = data.rounds > 0
+    if damage == "rounds":
+        data.facts["dagger"]["rounds"][0]["frames"] += 1
+    elif damage == "actor":
+        data.rows["dagger.actor"] = np.where(driven, "nobody", data.rows["dagger.actor"])
+    else:
+        data.rows["action"] = [a + 0.01 * d for a, d in zip(data.rows["action"], driven, strict=True)]
+    assert any(complaints(data, check) for check in CHECKS.values())
+
+
+def test_killed_at_several_stages_it_ends_in_the_same_bytes(made, settings, tmp_path):
+    store = tmp_path / "store"
+    for stage in ("checkpoints/*/spec.json", "rounds/*.partial/shards/*/outcome.json", "dagger/*/spec.json"):
+        process = start(settings, tmp_path / "set", store, "--workers=1", "--together=1")
+        while not list(store.glob(stage)):
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    finish(start(settings, tmp_path / "set", store, "--workers=1", "--together=1"))
+    assert hashes(tmp_path / "set") == hashes(made[0])
+
+
+def test_joined_features_are_those_of_the_whole_set_encoded(made, settings):
+    config = parse(DaggerConfig, ["--repo_id=local/driven"], settings)
+    plan, store = Plan(config), Store(settings.parent / "store")
+    whole, parts = obtain_data(plan, ROUNDS, store), parts_of(plan, ROUNDS, store)
+    folder = store.folder(features_artifact(plan.policy, whole))
+    with FeatureTrainer().joined(plan.policy, whole, parts, store):
+        joined = hashes(folder)
+    assert not folder.exists()
+    obtain_features(plan.policy, whole, store)
+    assert joined == hashes(folder)
+
+
+def hashes(root):
+    files = [path for path in root.rglob("*") if path.is_file() and path.suffix != ".log"]
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}

@@ -1,0 +1,88 @@
+"""What a DAgger run's policies, rounds and data sets depend on, found without running any of them."""
+
+from dataclasses import replace
+
+import pytest
+
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.parsing import parse
+from lerobot_constructskill.presets import find, names
+from lerobot_constructskill.study.runs import list_runs
+from lerobot_constructskill.study.spec import Setting, Study, Training, Variant
+
+ACT = {"type": "act", "pretrained_backbone_weights": None}
+CONFIG = DaggerConfig("local/set", ACT, base="smoke", rounds=3)
+
+
+def made(**fields):
+    plan = Plan(replace(CONFIG, **fields))
+    rounds = [plan.round(number).digest for number in (1, 2, 3)]
+    return [plan.checkpoint(number).digest for number in range(4)], rounds
+
+
+def test_every_policy_and_round_is_something_else():
+    checkpoints, rounds = made()
+    assert len({*checkpoints, *rounds}) == 7
+
+
+@pytest.mark.parametrize(
+    "fields", [{"repo_id": "local/other"}, {"root": "x"}, {"workers": 1}, {"together": 1}, {"eval_episodes": 3}]
+)
+def test_names_places_and_how_it_is_run_change_nothing(fields):
+    assert made(**fields) == made()
+
+
+def test_more_rounds_go_on_where_fewer_ended():
+    assert Plan(replace(CONFIG, rounds=9)).checkpoint(3).digest == made()[0][3]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"seed": 1}, {"base_episodes": 5}, {"policy": ACT | {"dim_model": 64}}, {"training": Training(epochs=1)}],
+)
+def test_another_learner_is_another_run_from_the_start(fields):
+    assert not {*sum(made(**fields), [])} & {*sum(made(), [])}
+
+
+@pytest.mark.parametrize("fields", [{"episodes": 5}, {"max_steps": 9}, {"patience": 3}, {"betas": [0.5]}])
+def test_another_way_to_drive_shares_the_policy_of_the_demonstrations_alone(fields):
+    (first, *others), rounds = made(**fields)
+    (same, *before), driven = made()
+    assert first == same and not {*others, *rounds} & {*before, *driven}
+
+
+def test_a_later_beta_changes_the_later_rounds_alone():
+    assert made(betas=[0.0, 0.5])[1][0] == made()[1][0]
+    assert made(betas=[0.0, 0.5])[1][1] != made()[1][1]
+
+
+def test_seeds_of_rounds_never_meet():
+    plan = Plan(CONFIG)
+    seeds = [seed for number in (1, 2, 3) for seed in plan.seeds(number)]
+    assert len(set(seeds)) == 3 * CONFIG.episodes and min(seeds) > plan.base.seed_start + plan.base.episodes
+
+
+def test_labels_that_are_not_the_experts_are_refused():
+    with pytest.raises(InputError, match="executed"):
+        _ = Plan(replace(CONFIG, base="fast_executed_labels")).base
+
+
+@pytest.mark.parametrize("name", names("dagger"))
+def test_every_shipped_configuration_makes_a_plan(name):
+    plan = Plan(parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", name)))
+    assert plan.checkpoint(plan.config.rounds).digest != plan.checkpoint(0).digest
+
+
+def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives():
+    variants = {"driven": Variant(ACT, seeds=2, dagger="smoke"), "cloned": Variant(ACT, seeds=1)}
+    study = Study("x", {"fixed": Setting("smoke")}, variants, training=Training(epochs=3))
+    first, second, cloned = list_runs(study)
+    config = parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", "smoke"))
+    for run in (first, second):
+        plan = Plan(replace(config, policy=ACT, training=Training(epochs=3), seed=run.seed))
+        assert run.checkpoint.digest == plan.checkpoint(config.rounds).digest
+    assert cloned.checkpoint.digest == first.dagger.checkpoint(0).digest
+    assert first.checkpoint.digest != second.checkpoint.digest
