@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds test check bench dist docs pins
+.PHONY: help setup demo ten-seeds test check bench dist docs image pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -34,6 +34,10 @@ bench: setup ## every speed claim, measured side by side on this machine, into b
 
 dist: setup ## the wheel and the source distribution, into dist/
 	.venv/bin/python -m build --no-isolation
+
+image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BASE=another Debian 13
+	$(firstword $(foreach tool,docker podman buildah,$(shell command -v $(tool)))) build -t constructskill \
+		-f examples/vla_evaluation_harness/Dockerfile $(if $(BASE),--build-arg BASE=$(BASE)) .
 
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict

@@ -30,7 +30,6 @@ SHORT = {
 
 NOT_RUN = {
     "pip install": "changes the environment that the tests run in",
-    "constructskill-doctor": "judges the machine, not the command: tests/test_doctor.py",
     "uv venv": "makes an environment with another LeRobot",
     "/tmp/other/": "runs in that environment",
     "examples/smoke_evaluation.sh": "needs the checkout: tests/test_lerobots_evaluation.py",
