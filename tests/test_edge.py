@@ -17,7 +17,7 @@ from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts import console
 
 SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
-BARE = {"constructskill-doctor", "constructskill-config"}
+BARE = {"constructskill", "constructskill-doctor", "constructskill-config"}
 """Commands without a configuration."""
 
 NEEDED = {

@@ -24,7 +24,8 @@ from lerobot_constructskill.errors import (
 REPOSITORY = Path(__file__).parents[1]
 MODULES = sorted((REPOSITORY / "lerobot_constructskill").rglob("*.py"))
 PYTHONS = {"ValueError", "OSError", "FileNotFoundError", "FileExistsError"}
-COMMANDS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+SCRIPTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
+COMMANDS = {name: target for name, target in SCRIPTS.items() if "-" in name}  # `constructskill` starts one of them
 
 BREAK = """
 import importlib, sys

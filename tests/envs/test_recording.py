@@ -1,10 +1,13 @@
 """What is recorded is what was executed: a recording, executed again, ends alike, whoever ran it."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
 from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER, Recording, read_recordings, write_recordings
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
@@ -46,17 +49,24 @@ def test_every_finished_episode_is_recorded_and_no_other(tmp_path, monkeypatch):
         np.testing.assert_array_equal(one.flat, np.tile(DOWN_OPEN.astype(np.float32), 3))
 
 
+STEP_TWO = """
+import numpy as np
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+config = ConstructSkillEnvConfig(task="block_to_bin", episode_length=2)
+vector = config.create_envs(n_envs=2, use_async_envs={use_async_envs})["constructskill"][0]
+vector.reset(seed=[7, 8], options={{"lerobot_new_rollout": True}})
+for _ in range(5):  # a frozen episode goes on returning, and is over
+    vector.step(np.tile([0, 0, 0.01, 1], (2, 1)))
+vector.close()
+"""
+
+
 @pytest.mark.sim
 @pytest.mark.parametrize("use_async_envs", [False, True])
-def test_lerobots_vector_environments_record(use_async_envs, tmp_path, monkeypatch):
-    monkeypatch.setenv(FOLDER, str(tmp_path))
-    config = ConstructSkillEnvConfig(task="block_to_bin", episode_length=2)
-    vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
-    vector.reset(seed=[7, 8], options={"lerobot_new_rollout": True})
-    actions = np.tile([0, 0, 0.01, 1], (2, 1))
-    for _ in range(5):  # a frozen episode goes on returning, and is over
-        vector.step(actions)
-    vector.close()
+def test_lerobots_vector_environments_record(use_async_envs, tmp_path):
+    """In a process of its own: a fork server that other tests have started does not hear of the variable."""
+    code = STEP_TWO.format(use_async_envs=use_async_envs)
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {FOLDER: str(tmp_path)}, check=True)
     recordings = [recording for path in sorted(tmp_path.iterdir()) for recording in read_recordings(path)]
     assert [(one.evaluation_seed, one.steps, len(one.flat)) for one in recordings] == [
         (seed, 2, 2 * len(get_task("block_to_bin").action_names)) for seed in (7, 8)
