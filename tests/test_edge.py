@@ -66,6 +66,8 @@ def flat_fields(config_class: type, before: str = "") -> list[str]:
 def flags(command: str, config_class: type) -> list[str]:
     if command == "constructskill-study":
         return [f"--config_path={find('study', 'smoke')}"]
+    if command == "constructskill-dagger":
+        return [f"--config_path={find('dagger', 'smoke')}", f"--repo_id={NEEDED['repo_id']}"]
     return [f"--{field.name}={NEEDED[field.name]}" for field in fields(config_class) if is_needed(field)]
 
 
