@@ -4,6 +4,7 @@ import platform
 import sys
 from importlib import import_module, metadata
 
+from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.errors import DISTRIBUTION, InputError
 from lerobot_constructskill.scripts.console import EPILOG, edge
 
@@ -18,13 +19,11 @@ def commands() -> dict[str, metadata.EntryPoint]:
     return {entry.name.removeprefix(PREFIX): entry for entry in ours if entry.name.startswith(PREFIX)}
 
 
-def versions() -> str:
-    installed = {d.metadata["Name"].replace("-", "_").lower(): d.version for d in metadata.distributions()}
-    told = [
-        f"Python {platform.python_version()}",
-        *(f"{name} {installed[name]}" for name in RELIES_ON if name in installed),
-    ]
-    return f"constructskill {metadata.version(DISTRIBUTION)} ({', '.join(told)})"
+def tell_versions() -> str:
+    told = {"Python": platform.python_version(), **versions(*RELIES_ON)}
+    return (
+        f"constructskill {metadata.version(DISTRIBUTION)} ({', '.join(f'{name} {one}' for name, one in told.items())})"
+    )
 
 
 def overview() -> str:
@@ -54,7 +53,7 @@ def main() -> None:
             case [] | ["-h" | "--help"]:
                 return print(overview())
             case ["--version"]:
-                return print(versions())
+                return print(tell_versions())
             case [name, *flags]:
                 command = find(name)
                 sys.argv = [command.name, *flags]
