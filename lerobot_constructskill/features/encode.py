@@ -16,7 +16,7 @@ from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
-from lerobot_constructskill.policies.frozen_vit.backbones import Backbone, get_backbone
+from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
@@ -86,7 +86,8 @@ def write_feature_set(
         features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
         _write_copy(dataset, camera, features, info, repo_id, folder)
         if patches:
-            _join_patches(dataset, parts, encoder.spec, folder / PATCHES_FILE)
+            of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
+            _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
 
 
 def join_feature_sets(
@@ -110,16 +111,17 @@ def join_feature_sets(
     with room_for(folder):
         _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder)
         if patches:
-            _join_files([part.root / PATCHES_FILE for part in parts], folder / PATCHES_FILE)
+            _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
 
 
-def _join_files(files: Sequence[Path], joined: Path) -> None:
-    arrays = [np.load(file, mmap_mode="r") for file in files]
-    rows = sum(map(len, arrays))
-    out, first = np.lib.format.open_memmap(joined, "w+", dtype=np.float16, shape=(rows, *arrays[0].shape[1:])), 0
-    for array in arrays:
-        out[first : first + len(array)] = array
-        first += len(array)
+def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
+    """Write the rows of several files of patch features, one open at a time, into one of so many frames."""
+    shape = (frames, *np.load(files[0], mmap_mode="r").shape[1:])
+    out, first = np.lib.format.open_memmap(joined, "w+", dtype=np.float16, shape=shape), 0
+    for file in files:
+        rows = np.load(file, mmap_mode="r")
+        out[first : first + len(rows)] = rows
+        first += len(rows)
 
 
 def _with_source(info: dict[str, str], dataset: LeRobotDataset) -> dict[str, str]:
@@ -171,14 +173,6 @@ def _encode(encoder: FrozenEncoder, images: Tensor, with_patches: bool) -> tuple
 def _save(file: Path, array: np.ndarray) -> None:
     with replaced(file) as partial:
         np.save(partial, array)
-
-
-def _join_patches(dataset: LeRobotDataset, parts: Path, spec: Backbone, file: Path) -> None:
-    shape = (dataset.num_frames, spec.n_patches, spec.feature_dim)
-    joined = np.lib.format.open_memmap(file, "w+", dtype=np.float16, shape=shape)
-    for episode in dataset.meta.episodes:
-        rows = slice(episode["dataset_from_index"], episode["dataset_to_index"])
-        joined[rows] = np.load(_part(parts, episode).with_suffix(PATCHES))
 
 
 def _write_copy(
