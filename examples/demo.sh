@@ -56,4 +56,4 @@ for seed in $SEEDS; do
 done
 echo
 echo "Left out for time: 30 of the 80 demonstrations, more training seeds, by which results are reported (SEEDS='0 1 2' make"
-echo "demo goes on from here; make ten-seeds runs ten, with a report), and the sole camera of the paper, which is harder."
+echo "demo goes on from here; make ten-seeds runs ten, with a report), and the base camera alone, as in the paper, which is harder."

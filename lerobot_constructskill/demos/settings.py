@@ -27,7 +27,7 @@ class GenerateConfig:
         root: folder to write; `$HF_LEROBOT_HOME/<repo_id>` by default. It must not exist.
         task: a name in `contract.TASKS`.
         episodes: successful demonstrations to record.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist view). The state is always
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera). The state is always
             recorded.
         max_steps: steps after which an attempt counts as failed.
         max_failures: failed attempts, as a fraction of `episodes`, at which the run gives up.

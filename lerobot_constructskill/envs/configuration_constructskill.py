@@ -28,7 +28,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     Args:
         task: a name in `contract.TASKS` or in `contract.SUITES`, or several with commas between; their actions must
             be alike.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the 8-number
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the 8-number
             state, for policies that need them).
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.

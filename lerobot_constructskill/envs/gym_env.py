@@ -54,7 +54,7 @@ class ConstructSkillEnv(gym.Env):
 
     Args:
         task: a name in `contract.TASKS`.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the state).
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu", "cpu", or "none": physics alone, ten

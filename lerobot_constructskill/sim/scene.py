@@ -87,7 +87,7 @@ class PickPlaceEnv(BaseEnv):
       consecutive steps.
 
     Args:
-        cameras: names of the cameras in `contract.CAMERAS` to observe with; the paper's sole view by default.
+        cameras: names of the cameras in `contract.CAMERAS` to observe with; the base camera by default.
         light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
         robot_uids: ManiSkill's; the Panda by default, drawn as `light_robot` says.
         perturbation: what differs from the task as it is; nothing by default.

@@ -28,7 +28,7 @@ NEVER = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Three noisy demonstrations with the wrist view, and their frames as a table."""
+    """Three noisy demonstrations with the wrist camera, and their frames as a table."""
     root = tmp_path_factory.mktemp("data") / "set"
     summary = record(GenerateConfig("local/set", str(root), episodes=3, obs_type="pixels_agent_pos"))
     dataset = LeRobotDataset("local/set", root=root)
