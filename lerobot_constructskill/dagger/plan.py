@@ -40,7 +40,7 @@ class Plan:
             flags.append(f"--episodes={self.config.base_episodes}")
         base = parse(GenerateConfig, flags, find("generate", self.config.base))
         if base.labels != "clean":
-            raise InputError(f"The base '{self.config.base}' has executed actions for labels; DAgger's are clean.")
+            raise InputError(f"The base '{self.config.base}' has executed actions as labels; DAgger needs clean ones.")
         return base
 
     @cached_property

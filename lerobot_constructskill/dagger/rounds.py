@@ -95,7 +95,7 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
     outcomes = [outcome for seed in plan.seeds(number) for outcome in _read(shards / str(seed) / OUTCOME)]
     roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
     if not roots:
-        raise InputError(f"No episode of round {number} has a frame in which the expert knew a way to success.")
+        raise InputError(f"Round {number} has no frame in which the expert knew a way to success.")
     with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
         aggregate(repo_id, roots, folder, Path(scratch))
     _save(outcomes, folder / OUTCOMES)
@@ -106,7 +106,7 @@ def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: S
     checkpoint = store.folder(plan.checkpoint(policy))
     learner = PolicyAgent.from_pretrained(checkpoint, plan.policy.device, **here)
     if OBS_STATE in learner.policy.config.input_features and plan.base.obs_type == "pixels":
-        raise InputError("The policy reads observation.state; take a base with obs_type 'pixels_agent_pos'.")
+        raise InputError("The policy reads observation.state; choose a base with obs_type 'pixels_agent_pos'.")
     expert = make_expert(plan.task, plan.base.expert)
     yield from drive_all(learner, expert, plan.env, seeds, drive, plan.config.together, plan.config.workers)
 

@@ -165,7 +165,7 @@ def _read_dagger(variant: Variant) -> Demonstrations:
 
 def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     if name not in REFERENCES:
-        raise InputError(f"Unknown reference '{name}'; there are: {', '.join(REFERENCES)}.")
+        raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
     reference = REFERENCES[name]
     arm = Arm(name=name, role=REFERENCE if reference.looks else SIGHTLESS, demonstrations=None, **common)
     if reference.policy:

@@ -33,12 +33,12 @@ class Variant:
     Args:
         policy: fields of a LeRobot policy, `type` among them.
         seeds: how many training seeds, `first_seed` and those that follow it.
-        data: other demonstrations than the setting's, for an ablation of the data.
+        data: demonstrations to use instead of the setting's, for an ablation of the data.
         dagger: what `constructskill-dagger` takes, a name or file: each seed is trained on rounds that it drives
-            itself. Its demonstrations and rounds count; policy, training and seed are the variant's.
+            itself. Only its demonstrations and rounds are used; policy, training and seed are the variant's.
         settings: names of the settings it runs in; all of them by default.
         training: fields of `Training` that differ from the study's.
-        first_seed: seeds that something is chosen on are not those that are reported (0 and up).
+        first_seed: the first training seed; results are reported on seeds from 0 on, choices are made on others.
     """
 
     policy: dict[str, Any]
@@ -56,15 +56,15 @@ class Variant:
 
 @dataclass(frozen=True)
 class Training:
-    """How every variant is trained (spec, section 4). Learning rate and weight decay are the policy's.
+    """How every variant is trained. Learning rate and weight decay are the policy's.
 
     Args:
         epochs: passes over the demonstrations that are not held out.
         batch_size: frames per step.
-        holdout: one demonstration of so many is held out.
+        holdout: every holdout-th demonstration is held out.
 
     Raises:
-        ValueError: a number that nothing can be trained with.
+        ValueError: a number out of its range.
     """
 
     epochs: Count = 150
@@ -77,7 +77,7 @@ class Training:
 
 @dataclass(frozen=True)
 class Study:
-    """Runs that are to be compared: every variant in every setting with every seed, and references beside them.
+    """Runs to compare: every variant in every setting with every seed, and references.
 
     Args:
         name: what the study is called.
@@ -89,7 +89,7 @@ class Study:
         eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
 
     Raises:
-        ValueError: a name or count that no study can be run with.
+        ValueError: a name or a number that cannot be used.
     """
 
     name: Annotated[str, Pattern(NAME, "a name of a-z, 0-9, '_' and '-'")]
@@ -104,13 +104,15 @@ class Study:
         check(self)
         for name in (*self.settings, *self.variants):
             if not re.fullmatch(NAME, name):
-                raise InputError(f"'{name}' is no name for a setting or variant; use a-z, 0-9, '_' and '-'.")
+                raise InputError(f"'{name}' cannot name a setting or variant; use a-z, 0-9, '_' and '-'.")
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
                 raise InputError(f"A study needs at least one of {kind}.")
         names = [*self.settings, *self.variants, *self.references]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise InputError(f"'{twice[0]}' is the name of two things; settings, variants and references differ.")
+            raise InputError(
+                f"'{twice[0]}' is the name of two things; settings, variants and references need different names."
+            )
         for name, seeds in self.references.items():
             check_values(Variant, {"seeds": seeds}, f"references.{name}: ")
         for name, variant in self.variants.items():
@@ -118,9 +120,11 @@ class Study:
             unknown = [setting for setting in variant.settings or [] if setting not in self.settings]
             if unknown:
                 known = ", ".join(self.settings)
-                raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; there are: {known}.")
+                raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; the settings are: {known}.")
             if variant.dagger and variant.data:
-                raise InputError(f"Variant '{name}' has data, and dagger, which brings its own; name one of them.")
+                raise InputError(
+                    f"Variant '{name}' has both data and dagger, which brings its own data; give only one."
+                )
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
 

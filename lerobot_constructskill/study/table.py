@@ -51,7 +51,7 @@ class Table:
         if name not in self._made and self.store.has(run.artifact):
             file = self.store.folder(run.artifact) / EPISODES
             if not file.is_file():
-                raise InputError(f"{file.parent} has no episodes, as no run of ours is left: move it away.")
+                raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
         return self._made.get(name)
 

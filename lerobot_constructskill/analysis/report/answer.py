@@ -1,8 +1,9 @@
 """What a study says, in sentences made from its findings: the paragraph at the top of a report."""
 
 from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
-from lerobot_constructskill.analysis.report.wording import episodes, listed, plural, seeds, share_range, tau
+from lerobot_constructskill.analysis.report.wording import episodes, listed, seeds, share_range, tau
 from lerobot_constructskill.analysis.stats.comparisons import Comparison, Verdict
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.rows import SIGHTLESS
 
 SOLVED = 0.9

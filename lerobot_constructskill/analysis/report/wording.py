@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from lerobot_constructskill.analysis.stats.correlation import Correlation
 from lerobot_constructskill.analysis.stats.intervals import Estimate
+from lerobot_constructskill.errors import plural
 
 
 def percent(share: float) -> str:
@@ -80,10 +81,6 @@ def episodes(share: float, n: int) -> str:
 
 def seeds(n: int) -> str:
     return plural(n, "seed")
-
-
-def plural(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def listed(items: Sequence[str]) -> str:
