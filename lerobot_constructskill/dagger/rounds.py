@@ -22,7 +22,7 @@ from lerobot_constructskill.demos.shards import EPISODE, write_episode
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.training.trainers import trainer_of
 
 SHARDS = "shards"
 OUTCOME, OUTCOMES = "outcome.json", "outcomes.json"

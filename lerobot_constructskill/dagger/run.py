@@ -19,8 +19,8 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_evaluation, obtain_round, totals
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import plural
-from lerobot_constructskill.study.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
+from lerobot_constructskill.training.trainers import trainer_of
 
 ROUNDS = "rounds.json"
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from lerobot_constructskill.bounds import Count, NotEmpty, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.spec import Training
+from lerobot_constructskill.training.recipe import Training
 
 Beta = Annotated[float, Range(0, 1)]
 

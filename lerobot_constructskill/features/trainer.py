@@ -24,7 +24,7 @@ from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load
 
 
 class FeatureTrainer:
-    """`study.trainers.Trainer` of frozen_vit."""
+    """`training.trainers.Trainer` of frozen_vit."""
 
     seeds_together = True
     places = ("backbone_path", "backbone_source")

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
-from lerobot_constructskill.bounds import Among, BatchSize, Count, Pattern, Range, Seed, Workers, check, check_values
-from lerobot_constructskill.contract import HELD_OUT_EVERY
+from lerobot_constructskill.bounds import Among, Count, Pattern, Seed, Workers, check, check_values
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.training.recipe import Training
 
 NAME = r"[a-z0-9][a-z0-9_-]*"
 """What studies, settings and variants are called: they name folders and videos, and stand in every row."""
@@ -52,27 +52,6 @@ class Variant:
     @property
     def training_seeds(self) -> range:
         return range(self.first_seed, self.first_seed + self.seeds)
-
-
-@dataclass(frozen=True)
-class Training:
-    """How every variant is trained. Learning rate and weight decay are the policy's.
-
-    Args:
-        epochs: passes over the demonstrations that are not held out.
-        batch_size: frames per step.
-        holdout: every holdout-th demonstration is held out.
-
-    Raises:
-        ValueError: a number out of its range.
-    """
-
-    epochs: Count = 150
-    batch_size: BatchSize = 256
-    holdout: Annotated[int, Range(2, 1_000_000)] = HELD_OUT_EVERY
-
-    def __post_init__(self):
-        check(self, "training.")
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from typing import Any
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import LOG, Store
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.checkpoints import read_facts
 from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.validate import read_error
+from lerobot_constructskill.training.checkpoints import read_facts
 
 VIDEOS = "videos"
 

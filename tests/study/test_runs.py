@@ -14,8 +14,9 @@ from lerobot_constructskill.study.execute import EPISODES
 from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import list_runs
-from lerobot_constructskill.study.spec import Options, Setting, Study, Training, Variant
+from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
+from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
 """A policy that needs no weights from anywhere."""

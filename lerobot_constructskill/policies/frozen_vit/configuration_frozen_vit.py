@@ -92,7 +92,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     """
 
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
-    """What trains it in a study, `study.trainers.Trainer`: many seeds at once, on features that are encoded once."""
+    """What trains it in a study, a `training.trainers.Trainer`: many seeds at once, on features encoded once."""
 
     device: DeviceName | None = None
     n_obs_steps: Annotated[int, Range(1, 1)] = 1
