@@ -83,6 +83,11 @@ def seeds(n: int) -> str:
     return plural(n, "seed")
 
 
+def quoted(label: str) -> str:
+    """A label as it stands in a sentence: in quotation marks where it has a comma of its own."""
+    return f"“{label}”" if "," in label else label
+
+
 def listed(items: Sequence[str]) -> str:
     """ "a, b and c"."""
     return " and ".join([", ".join(items[:-1]), items[-1]] if len(items) > 1 else items)
