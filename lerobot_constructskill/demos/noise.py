@@ -28,7 +28,7 @@ class NoiseConfig:
         covariance: 3 x 3, in m2: a policy's error on held-out demonstrations, as `constructskill-fit-noise` writes it.
         fitted_on: what the covariance was fitted on, for the data set's provenance.
         clip: bound on each axis of the executed translation, in metres, with and without noise.
-        phases: names of the phases that are perturbed. GRASP and RELEASE stay clean, so that contact is not.
+        phases: names of the phases that are perturbed. GRASP and RELEASE have no noise, to keep contacts clean.
 
     Raises:
         ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or wrong.

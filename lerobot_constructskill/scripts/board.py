@@ -1,4 +1,4 @@
-"""`constructskill-board`: the board's pages from a folder of submissions."""
+"""`constructskill-board`: make the board's pages from a folder of submissions."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -27,7 +27,7 @@ class CheckTaskConfig:
         ValueError: there is no such task, the counts are out of range, or the task fails its check.
     """
 
-    task: str
+    task: str  # a name in `contract.TASKS`
     states: Count = 100  # random initial states, without rendering
     noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
     expert: ExpertConfig = field(default_factory=ExpertConfig)

@@ -27,7 +27,7 @@ class EncodeConfig:
     camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
-    batch_size: BatchSize = 16
+    batch_size: BatchSize = 16  # images at a time
     device: Device | None = None  # default: a GPU if there is one
 
     def __post_init__(self):

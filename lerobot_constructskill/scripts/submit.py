@@ -1,4 +1,4 @@
-"""`constructskill-submit`: a submission for the board from what was recorded."""
+"""`constructskill-submit`: make a submission for the board from recorded episodes."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,6 +9,8 @@ from lerobot_constructskill.bounds import Among, Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
+Suite = Annotated[str, Among(tuple(SUITES))]
+
 
 @dataclass
 class SubmitConfig:
@@ -18,7 +20,7 @@ class SubmitConfig:
     `recorded/seed_<training seed>`.
     """
 
-    suite: Annotated[str, Among(tuple(SUITES))]  # the suite, which has the settings and starts
+    suite: Suite  # its settings and starts are evaluated
     about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; optional: url and notes
     root: Path  # the folder to write
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed

@@ -20,9 +20,7 @@ class VerifyConfig:
     sample: Count | None = None  # number of episodes to replay, drawn at random; default: all
     workers: Workers | None = None  # processes; default: one per core
     record: Path | None = None  # folder to write the verdict to, for the board
-    value: Text | None = (
-        None  # public random number, newer than the submission: print the starts and commands of a re-run
-    )
+    value: Text | None = None  # public random number, newer than the submission: print how to make a re-run
     rerun: Path | None = None  # a submission from those starts: verify it too, and compare the two
 
     def __post_init__(self):

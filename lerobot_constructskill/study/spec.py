@@ -126,13 +126,13 @@ class Options:
     """How a study is run.
 
     Args:
-        only: make only runs setting/variant/seed_N that fit this, such as `fixed` or `fixed/*/seed_[0-4]`; commas
-            between several. (YAML reads a pattern that starts with `*` as something else, unless it is quoted twice.)
+        only: make only the runs setting/variant/seed_N that match, such as `fixed` or `fixed/*/seed_[0-4]`; several
+            separated by commas. (In YAML a pattern that starts with `*` must be quoted twice.)
         together: seeds that are trained and evaluated in one pass.
         executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
             store on a file system that all its machines share).
         workers: processes that generate demonstrations; jobs at a time on a Ray of this machine.
-        retry_failed: make again what failed before.
+        retry_failed: make runs again that failed before.
 
     Raises:
         ValueError: a count below 1 or an unknown executor.
