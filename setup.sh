@@ -44,7 +44,7 @@ missing_packages() {
     for package in "$@"; do [[ -n "$(installed_version "$package")" ]] || echo "$package"; done
 }
 
-# The commands that need root, as root or through sudo; fails where neither is to be had.
+# The commands that need root, as root or through sudo; fails where neither is possible.
 as_root() {
     if [[ $EUID -eq 0 ]]; then "$@"; else sudo "$@"; fi
 }
@@ -265,7 +265,7 @@ setup_libpython() {
     .venv/bin/python -c "import ctypes; ctypes.CDLL('$package.so.1.0')" 2>/dev/null && return 0
     say "installing $package, for torchcodec"
     { command -v apt-get >/dev/null && can_be_root && apt_install "$package"; } ||
-        warn "no $package to be had; LeRobot decodes video with PyAV instead of torchcodec."
+        warn "$package cannot be installed; LeRobot decodes video with PyAV instead of torchcodec."
 }
 
 setup_venv() {
@@ -281,7 +281,7 @@ setup_venv() {
     "$UV" pip install --quiet --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]" ||
         die "the packages could not be installed; see the lines above."
     "$UV" pip install --quiet --python .venv/bin/python --no-deps "$MOBILENET" ||
-        warn "no $MOBILENET to be had; --policy.backbone=mobilenet_v2 then needs --policy.backbone_path."
+        warn "$MOBILENET cannot be installed; --policy.backbone=mobilenet_v2 then needs --policy.backbone_path."
     check_name
     setup_libpython
     fingerprint >"$STAMP"

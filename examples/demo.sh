@@ -55,5 +55,5 @@ for seed in $SEEDS; do
     python examples/count_outcomes.py "$OUT"
 done
 echo
-echo "Left out for time: 30 of the 80 demonstrations, more training seeds, by which results are reported (SEEDS='0 1 2' make"
-echo "demo goes on from here; make ten-seeds runs ten, with a report), and the sole camera of the paper, which is harder."
+echo "Left out to save time: 30 of the 80 demonstrations; more training seeds, which results are reported by (SEEDS='0 1 2' make"
+echo "demo continues from here; make ten-seeds runs ten, with a report); and the base camera alone, as in the paper, which is harder."

@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH" HF_HUB_OFFLINE=1
 OUT="${OUT:-outputs/smoke_evaluation}" TASK="${TASK:-brick_to_bin}"
 
-# Random weights of the smallest network: nothing is to be had from anywhere.
+# Random weights of the smallest network: nothing has to be downloaded.
 policy=(--policy.type=frozen_vit --policy.backbone=vit_tiny16 --policy.backbone_pretrained=false
     --policy.push_to_hub=false)
 env=(--env.type=constructskill --env.task="$TASK" --env.episode_length=20)

@@ -69,6 +69,11 @@ def remedy_of(error: ModuleNotFoundError) -> str | None:
     return None
 
 
+def plural(n: int, noun: str) -> str:
+    """A count with its noun: "1 run", "2 runs"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
 def first_line(error: Exception) -> str:
     """Of an error's message, or its class where it has none."""
     return next(iter(str(error).strip().splitlines()), type(error).__name__)

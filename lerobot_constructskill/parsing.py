@@ -50,7 +50,7 @@ def as_input() -> Iterator[None]:
     except FieldError as error:
         raise InputError(str(error)) from None
     except (TypeError, AttributeError):  # draccus merges fields, and copies them, before it looks at them
-        raise InputError("The configuration's file is empty or not a mapping of fields.") from None
+        raise InputError("The configuration's file is empty or is not a mapping of fields.") from None
     except Exception as error:  # those of draccus, argparse and YAML have no base in common
         root = error
         while root.__cause__ is not None:

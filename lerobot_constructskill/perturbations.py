@@ -23,7 +23,7 @@ class Axis:
 
 
 AXES = {
-    "camera": Axis("metres between the fixed camera's eye and its nominal place", (0.02, 0.05, 0.10)),
+    "camera": Axis("metres between the base camera's eye and its nominal place", (0.02, 0.05, 0.10)),
     "light": Axis("relative change of the lights' brightness, and of their direction", (0.2, 0.4, 0.6)),
     "texture": Axis("relative change of the brick's and the ground's colour, with another pattern", (0.1, 0.2, 0.4)),
     "size": Axis("factor of the square root of a brick's dimension: EN 771-1's categories T2 and T1", (0.25, 0.40)),

@@ -30,7 +30,7 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     if Path(name).is_file():
         return Path(name)
     raise MissingError(
-        f"There is no file and no {kind} configuration '{name}'; by name there are: {', '.join(names(kind))}."
+        f"There is no file and no {kind} configuration '{name}'; the configurations are: {', '.join(names(kind))}."
     )
 
 

@@ -53,8 +53,8 @@ def run(command: str, error: str, state: Path, *flags: str) -> subprocess.Comple
 def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, tmp_path: Path) -> None:
     done = run(command, "KeyError('a b')", tmp_path, "--debug")
     log = tmp_path / "constructskill" / f"{command}.log"
-    said = f"{command}: this is a fault of ours, not of your input: KeyError: 'a b'; the traceback is in {log}\n"
-    assert done.returncode == 70 and done.stderr.endswith(said)
+    said = f"this is a fault of constructskill, not of your input: KeyError: 'a b'; the traceback is in {log}\n"
+    assert done.returncode == 70 and done.stderr.endswith(f"{command}: {said}")
     for told in done.stderr, log.read_text():
         assert "Traceback" in told and "in broken\nKeyError: 'a b'" in told
 
@@ -78,7 +78,7 @@ def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) ->
     ("error", "status", "said"),
     [
         ("OSError(28, 'No space left on device')", 1, "[Errno 28] No space left on device"),
-        ("ModuleNotFoundError('No module named x', name='x')", 1, "No module named x; constructskill-doctor tells"),
+        ("ModuleNotFoundError('No module named x', name='x')", 1, "No module named x; constructskill-doctor says"),
         ("ModuleNotFoundError('No module named sapien', name='sapien')", 1, "sapien is not installed; pip install '"),
         (
             "ModuleNotFoundError('No module named jinja2', name='jinja2')",

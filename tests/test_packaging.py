@@ -103,7 +103,7 @@ def test_one_command_lists_the_others_and_starts_them() -> None:
     assert front("config", "train/act").stdout == f"{show('train/act')}\n"
     assert front("generate", "fsat").stderr.startswith("constructskill-generate: There is no file and no")
     unknown = front("genrate")
-    assert unknown.returncode == 1 and "'genrate'; there are: board, " in unknown.stderr
+    assert unknown.returncode == 1 and "'genrate'; the commands are: board, " in unknown.stderr
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_a_command_takes_a_name_a_file_or_a_flag(arguments: str) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [("'fsat'", "'fsat'; by name there are: direct, "), ("'fast', '--config_path=x'", "give one of them")],
+    [("'fsat'", "'fsat'; the configurations are: direct, "), ("'fast', '--config_path=x'", "give only one")],
 )
 def test_a_command_tells_what_is_wrong_with_a_name(arguments: str, said: str) -> None:
     code = COMMAND.format(arguments=arguments)

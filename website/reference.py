@@ -19,7 +19,7 @@ INTERFACE = {
     ],
     "Demonstrations": ["demos.expert", "demos.pick_place", "demos.precise", "demos.noise", "demos.recorder"],
     "Rollouts": ["rollout.agents", "rollout.lockstep", "rollout.references"],
-    "Studies": ["study.spec", "study.rows"],
+    "Studies": ["study.spec", "training.recipe", "training.trainers", "study.rows"],
     "Statistics": [
         f"analysis.stats.{name}" for name in ("outcomes", "intervals", "comparisons", "correlation", "power", "spread")
     ],

@@ -58,7 +58,7 @@ def page(task: Task, expert: dict | None, outcomes: pd.DataFrame, limits: str) -
         f"# {task.name}",
         f"“{task.instruction}”",
         f'<video controls muted loop playsinline preload="metadata" src="../films/{task.name}.mp4"></video>',
-        "The scripted expert: what the policy sees, and a close-up.",
+        "The scripted expert: the policy's view, and a close-up.",
         conditions(*task.scene.split(":")),
         "## Observation and action",
         observations(),
@@ -120,7 +120,7 @@ def docstring(module: str, name: str) -> str:
 def expert_text(task: Task, measured: dict | None) -> str:
     name, command = task.expert.partition(":")[2], f"`python benchmarks/experts.py {task.name}`"
     yields = (
-        f"Under the noise of a data set at least {task.noisy_yield:.0%} of its demonstrations succeed; the others are "
+        f"Under the noise of a data set at least {task.noisy_yield:.0%} of the attempts succeed; the others are "
         "discarded."
     )
     if measured is None:

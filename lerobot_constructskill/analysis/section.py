@@ -35,7 +35,7 @@ class Analysis:
         check(self, "analysis.")
         for pair in self.comparisons or []:
             if len(pair) != 2 or pair[0] == pair[1]:
-                raise InputError(f"A comparison is a pair of variants, not {pair}.")
+                raise InputError(f"A comparison must be a pair of variants, not {pair}.")
 
     def check(self, variants: Collection[str], others: Collection[str] = ()) -> None:
         """Refuse names that the study does not have.
@@ -62,4 +62,4 @@ class Analysis:
 def _check_known(what: str, given: Iterable[str], known: Collection[str]) -> None:
     for name in given:
         if name not in known:
-            raise InputError(f"Unknown {what} '{name}'; there are: {', '.join(known)}.")
+            raise InputError(f"Unknown {what} '{name}'; the study has: {', '.join(known)}.")

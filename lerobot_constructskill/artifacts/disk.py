@@ -34,4 +34,4 @@ def room_for(path: Path) -> Iterator[None]:
         disk = disk_of(path)
         if shutil.disk_usage(disk).free >= FULL:
             raise
-        raise MachineError(f"The disk of {disk} is full: make room; the same command continues.") from error
+        raise MachineError(f"The disk of {disk} is full: make room; the same command then continues.") from error

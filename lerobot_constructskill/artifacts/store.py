@@ -64,7 +64,7 @@ class Store:
         if not folder.exists():
             return False
         if _read_spec(folder / SPEC) != json.loads(json.dumps(artifact.spec)):
-            raise InputError(f"{folder} is not what this version of the package puts there: move it away.")
+            raise InputError(f"{folder} was not made by this version of the package: move it away.")
         return True
 
     @contextmanager

@@ -42,7 +42,7 @@ def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
         InputError: the study has no such variant.
     """
     if not (root / ROWS).is_file():
-        raise MissingError(f"'{root}' is no folder of a study: {ROWS} is missing.")
+        raise MissingError(f"'{root}' is not the folder of a study: {ROWS} is missing.")
     rows = read_rows(root / ROWS)
     own = rows[rows["variant"] == variant]
     if own.empty:
@@ -104,7 +104,9 @@ def _versions(recordings: Iterable[Recording]) -> dict[str, str]:
 
 def _one(different: set[str], what: str) -> str:
     if len(different) > 1:
-        raise InputError(f"It was recorded with several {what}: {' and '.join(sorted(different))}; record with one.")
+        raise InputError(
+            f"The episodes were recorded with several {what}: {' and '.join(sorted(different))}; record them with one."
+        )
     return different.pop()
 
 
@@ -130,6 +132,6 @@ def _claim(name: str, setting: Setting, seed: int, start: int, pile: dict, failu
             f"--failures why training seed {seed} failed."
         )
     if len({one.flat.tobytes() for one in found}) > 1:
-        raise InputError(f"{where} was recorded with different actions; record into a folder that is empty.")
+        raise InputError(f"{where} was recorded twice, with different actions; record into an empty folder.")
     went = {key: value for key, value in vars(found[0]).items() if key in vars(Claim(start)) and key != "actions"}
     return Claim(**went, setting=name, training_seed=seed, actions=found[0].flat)

@@ -94,13 +94,13 @@ def read_entries(root: Path) -> list[Entry]:
         InputError: an entry is no submission; the message names it.
     """
     if not (root / ENTRIES).is_dir():
-        raise MissingError(f"'{root}' is no board: it has no folder '{ENTRIES}'.")
+        raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
     return [_entry(root, path) for path in sorted((root / ENTRIES).iterdir())]
 
 
 def _entry(root: Path, path: Path) -> Entry:
     if not NAME.allows(path.name):
-        raise InputError(f"The folder of an entry is called by {NAME.meaning}, not {path.name!a}.")
+        raise InputError(f"The folder of an entry must be called by {NAME.meaning}, not {path.name!a}.")
     submission = read_submission(path)
     verdict = _verdict(root / VERIFIED / f"{path.name}.json", submission)
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
@@ -116,7 +116,7 @@ def _verdict(path: Path, submission: Submission) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError):
         known = False
     if not known:
-        raise InputError(f"'{path}' is no verdict of constructskill-verify.")
+        raise InputError(f"'{path}' is not a verdict of constructskill-verify.")
     return verdict if verdict.get("submission") == submission.sha256 else {}
 
 

@@ -72,9 +72,9 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
     """
     first = fresh_start(submission.sha256, value)
     if again.declaration.settings != fresh_settings(submission.declaration.settings, first):
-        raise InputError(f"The re-run is not from the {first} and following starts that {value!a:.80} calls for.")
+        raise InputError(f"{value!a:.80} calls for the starts from {first} on; the re-run has others.")
     if again.declaration.training_seeds != submission.declaration.training_seeds:
-        raise InputError("The re-run is not of the submission's training seeds.")
+        raise InputError("The re-run does not have the submission's training seeds.")
     before, after = placed(submission), placed(again)
     return Comparison(value, [Rates(name, before[name], after[name]) for name in before])
 

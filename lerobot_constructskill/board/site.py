@@ -7,12 +7,13 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report.wording import percent, plural, share_range
+from lerobot_constructskill.analysis.report.wording import percent, share_range
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.protocol import CLASSES, LEVELS, RANKED_FROM, SUITES
 from lerobot_constructskill.contract import STAGES
+from lerobot_constructskill.errors import plural
 
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = Path(__file__).parents[1] / "analysis" / "report" / "templates"

@@ -25,10 +25,10 @@ def read_files(root: Path, most: Mapping[str, int]) -> dict[str, bytes]:
         InputError: something else is in it, a link or a device for instance, or a file is too large.
     """
     if root.is_symlink() or not root.is_dir():
-        raise MissingError(f"'{root}' is no folder of a submission.")
+        raise MissingError(f"'{root}' is not the folder of a submission.")
     found = {entry.name: entry for entry in os.scandir(root)}
     if absent := [name for name in most if name not in found]:
-        raise MissingError(f"'{root}' is no submission: {absent[0]} is missing.")
+        raise MissingError(f"'{root}' is not a submission: {absent[0]} is missing.")
     if others := sorted(set(found) - set(most)):
         raise InputError(f"'{root}' holds {others[0]!a}; a submission is {' and '.join(most)}, and nothing else.")
     return {name: _read(root / name, size) for name, size in most.items()}
@@ -38,10 +38,10 @@ def _read(path: Path, most: int) -> bytes:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
-        raise InputError(f"'{path}' is no regular file ({error.strerror}).") from None
+        raise InputError(f"'{path}' is not a regular file ({error.strerror}).") from None
     with open(descriptor, "rb") as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise InputError(f"'{path}' is no regular file.")
+            raise InputError(f"'{path}' is not a regular file.")
         content = file.read(most + 1)
     if len(content) > most:
         raise InputError(f"'{path}' has more than {most:,} bytes.")
@@ -60,7 +60,7 @@ class _Plain(yaml.SafeLoader):
     def construct_mapping(self, node, deep=False):
         keys = [self.construct_object(key) for key, _ in node.value]
         if twice := [key for key in keys if keys.count(key) > 1]:
-            raise InputError(f"{twice[0]!a} stands there twice")
+            raise InputError(f"{twice[0]!a} appears twice")
         return super().construct_mapping(node, deep)
 
 

@@ -23,7 +23,7 @@ from lerobot_constructskill.board.strangers import bounded_memory, make, read_fi
 from lerobot_constructskill.bounds import Among, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import STAGES, get_task
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
-from lerobot_constructskill.errors import InputError, first_line
+from lerobot_constructskill.errors import InputError, first_line, plural
 
 DECLARATION, EPISODES = "submission.yaml", "episodes.parquet"
 
@@ -247,7 +247,7 @@ def read_submission(root: Path) -> Submission:
     content = read_files(root, MOST)
     declaration = _declaration(read_yaml(content[DECLARATION], DECLARATION))
     if hashlib.sha256(content[EPISODES]).hexdigest() != declaration.episodes_sha256:
-        raise InputError(f"{EPISODES} is not the file that {DECLARATION} was written with: their hashes differ.")
+        raise InputError(f"{EPISODES} is not the file that {DECLARATION} was written with: its hash differs.")
     claims = _claims(_table(content[EPISODES], declaration))
     _check_starts(declaration, claims)
     for claim in claims:
@@ -277,7 +277,7 @@ def _table(content: bytes, declaration: Declaration) -> pa.Table:
             if file.metadata.num_rows != declaration.episodes:
                 raise InputError(
                     f"{EPISODES} has {file.metadata.num_rows:,} episodes; {DECLARATION} declares "
-                    f"{declaration.episodes:,} ({len(declaration.training_seeds)} training seeds)."
+                    f"{declaration.episodes:,} ({plural(len(declaration.training_seeds), 'training seed')})."
                 )
             groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
             if sum(group.total_byte_size for group in groups) > declaration.most_bytes + SLACK:
@@ -291,7 +291,7 @@ def _table(content: bytes, declaration: Declaration) -> pa.Table:
     except (pa.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{EPISODES} cannot be read: {first_line(error)[:200]!a}.") from None
     if table.num_rows != declaration.episodes:
-        raise InputError(f"{EPISODES} has other rows than it says.")
+        raise InputError(f"{EPISODES} does not have the number of rows that it states.")
     return table
 
 
@@ -321,7 +321,7 @@ def _check(claim: Claim, setting: Setting) -> None:
     if claim.error is not None:
         check_line(claim.error, f"{claim.where}: error")
         if Outcome(claim.evaluation_seed) != claim.outcome or len(claim.actions):
-            raise InputError(f"{claim.where} failed with an error, and so has neither outcome nor actions.")
+            raise InputError(f"{claim.where} failed with an error, so it must have neither outcome nor actions.")
         return
     if not 1 <= claim.steps <= setting.episode_length:
         raise InputError(f"{claim.where}: steps must be 1 to {setting.episode_length}, not {claim.steps}.")
@@ -341,7 +341,7 @@ def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:
             same = claim.setting, claim.evaluation_seed, claim.actions.tobytes()
             other = first.setdefault(same, claim)
             if other is not claim:
-                raise InputError(f"{claim.where} has the very actions of training seed {other.training_seed}.")
+                raise InputError(f"{claim.where} has exactly the actions of training seed {other.training_seed}.")
 
 
 def is_replayable(declaration: Declaration) -> bool:

@@ -16,8 +16,8 @@ from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.presets import find
-from lerobot_constructskill.study.checkpoints import LEARNING, checkpoint_artifact, settle_policy
-from lerobot_constructskill.study.trainers import packages_of
+from lerobot_constructskill.training.checkpoints import LEARNING, checkpoint_artifact, settle_policy
+from lerobot_constructskill.training.trainers import packages_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien", "av")
 """Packages whose versions may show in a round's frames, beside the policy's own."""
@@ -40,7 +40,7 @@ class Plan:
             flags.append(f"--episodes={self.config.base_episodes}")
         base = parse(GenerateConfig, flags, find("generate", self.config.base))
         if base.labels != "clean":
-            raise InputError(f"The base '{self.config.base}' has executed actions for labels; DAgger's are clean.")
+            raise InputError(f"The base '{self.config.base}' has executed actions as labels; DAgger needs clean ones.")
         return base
 
     @cached_property

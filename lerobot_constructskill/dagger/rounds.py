@@ -22,15 +22,15 @@ from lerobot_constructskill.demos.shards import EPISODE, write_episode
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.training.trainers import trainer_of
 
 SHARDS = "shards"
 OUTCOME, OUTCOMES = "outcome.json", "outcomes.json"
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How an episode went.
+class DrivenEpisode:
+    """What a round keeps of an episode that a policy drove.
 
     Args:
         seed: of its initial state.
@@ -45,12 +45,12 @@ class Outcome:
     by_expert: int
 
     @classmethod
-    def of(cls, episode: Episode) -> "Outcome":
+    def of(cls, episode: Episode) -> "DrivenEpisode":
         by_expert = sum(frame["dagger.actor"] == EXPERT for frame in episode.frames)
         return cls(episode.seed, episode.placed, len(episode.frames), by_expert)
 
 
-def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset, list[Outcome]]:
+def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset, list[DrivenEpisode]]:
     """A round's frames and outcomes, in the order of its seeds; driven if they are not there.
 
     Raises:
@@ -67,13 +67,13 @@ def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset,
     return LeRobotDataset(repo_id, root=folder), _read(folder / OUTCOMES)
 
 
-def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[Outcome]:
+def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpisode]:
     """How policy `number` does in every evaluation episode by itself."""
     made = plan.evaluation(number)
     with store.claim([made]) as missing:
         if missing:
             alone = Drive(number, beta=0.0, patience=plan.env["episode_length"] + 1)  # nobody gives up for it
-            outcomes = [Outcome.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
+            outcomes = [DrivenEpisode.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
             with store.writing(made) as folder:
                 folder.mkdir()
                 _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
@@ -91,11 +91,11 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
             shard.mkdir()
             if episode.frames:
                 write_episode(repo_id, plan.task, features, episode.frames, shard / EPISODE)
-            _save([Outcome.of(episode)], shard / OUTCOME)
+            _save([DrivenEpisode.of(episode)], shard / OUTCOME)
     outcomes = [outcome for seed in plan.seeds(number) for outcome in _read(shards / str(seed) / OUTCOME)]
     roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
     if not roots:
-        raise InputError(f"No episode of round {number} has a frame in which the expert knew a way to success.")
+        raise InputError(f"Round {number} has no frame in which the expert knew a way to success.")
     with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
         aggregate(repo_id, roots, folder, Path(scratch))
     _save(outcomes, folder / OUTCOMES)
@@ -106,20 +106,20 @@ def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: S
     checkpoint = store.folder(plan.checkpoint(policy))
     learner = PolicyAgent.from_pretrained(checkpoint, plan.policy.device, **here)
     if OBS_STATE in learner.policy.config.input_features and plan.base.obs_type == "pixels":
-        raise InputError("The policy reads observation.state; take a base with obs_type 'pixels_agent_pos'.")
+        raise InputError("The policy reads observation.state; choose a base with obs_type 'pixels_agent_pos'.")
     expert = make_expert(plan.task, plan.base.expert)
     yield from drive_all(learner, expert, plan.env, seeds, drive, plan.config.together, plan.config.workers)
 
 
-def _save(outcomes: Iterable[Outcome], path: Path) -> None:
+def _save(outcomes: Iterable[DrivenEpisode], path: Path) -> None:
     path.write_text(json.dumps([asdict(outcome) for outcome in outcomes]) + "\n")
 
 
-def _read(path: Path) -> list[Outcome]:
-    return [Outcome(**fields) for fields in json.loads(path.read_text())]
+def _read(path: Path) -> list[DrivenEpisode]:
+    return [DrivenEpisode(**fields) for fields in json.loads(path.read_text())]
 
 
-def totals(outcomes: Iterable[Outcome]) -> Mapping[str, Any]:
+def totals(outcomes: Iterable[DrivenEpisode]) -> Mapping[str, Any]:
     """What a line, and the provenance, say of a round's outcomes."""
     outcomes = list(outcomes)
     return {

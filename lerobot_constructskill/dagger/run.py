@@ -18,8 +18,9 @@ from lerobot_constructskill.dagger.merge import obtain_data, parts_of, write_sid
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_evaluation, obtain_round, totals
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.study.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.errors import plural
+from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
+from lerobot_constructskill.training.trainers import trainer_of
 
 ROUNDS = "rounds.json"
 
@@ -43,7 +44,7 @@ class Line:
     evaluated: dict[str, Any] | None
 
     def __str__(self) -> str:
-        said = [f"policy {self.policy}: trained on {self.frames} frames with the expert's labels"]
+        said = [f"policy {self.policy}: trained on {plural(self.frames, 'frame')} with the expert's labels"]
         if self.heldout_mse_m2 is not None:
             said.append(f"held-out error {self.heldout_mse_m2:.3g} m2")
         if self.evaluated:
@@ -51,8 +52,8 @@ class Line:
         if self.drove:
             drove = self.drove
             said.append(
-                f"drove round {self.policy + 1}: placed {drove['placed']} of {drove['episodes']}, {drove['frames']} "
-                f"frames, {drove['by_expert']} of them by the expert's hand"
+                f"drove round {self.policy + 1}: placed {drove['placed']} of {drove['episodes']}, "
+                f"{plural(drove['frames'], 'frame')}, {drove['by_expert']} of them by the expert's hand"
             )
         return "; ".join(said)
 

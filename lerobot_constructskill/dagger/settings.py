@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from lerobot_constructskill.bounds import Count, NotEmpty, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.spec import Training
+from lerobot_constructskill.training.recipe import Training
 
 Beta = Annotated[float, Range(0, 1)]
 
@@ -16,26 +16,26 @@ ROUND_SEED_START = 2_000_000
 
 @dataclass(frozen=True)
 class DaggerConfig:
-    """A policy is trained on demonstrations; in each round it drives, the expert labels every state that it comes to,
-    these frames are added, and it is trained anew on all of them.
+    """Train a policy on demonstrations; in each round it drives, the expert labels every state that it reaches, these
+    frames are added, and the policy is trained again on all of them.
 
     Args:
         repo_id: the data set's name, `user/name`.
         policy: fields of a LeRobot policy, `type` among them.
         root: folder to write: `dataset`, `checkpoint` and `rounds.json`; `outputs/dagger/<name>` by default.
-        store: where all that is made on the way lies, each thing once for all commands.
+        store: folder of everything that is made on the way, each thing once for all commands.
         base: the demonstrations to begin with: a name or file that `constructskill-generate` takes.
-        base_episodes: so many of them, in place of what `base` says.
+        base_episodes: their number; default: what `base` says.
         training: how the policy is trained, each time from the start.
         seed: training seed.
         rounds: how often the policy drives; with 0 it is behaviour cloning.
         episodes: episodes a round.
         max_steps: steps after which an episode ends without success; the task's horizon by default.
-        betas: with which probability the expert's action is executed in a step and not the policy's, for each round;
-            the last one is also that of the rounds which follow. The label is the expert's in every step.
-        seed_start: seed of the first episode; they count up through all rounds.
-        patience: an episode ends after so many steps in a row in which the expert knows no way to success.
-        eval_episodes: episodes in which every policy is evaluated beside the rounds, the same for all.
+        betas: for each round the probability that a step executes the expert's action and not the policy's; the
+            last one is also for the rounds that follow. The label is the expert's in every step.
+        seed_start: seed of the first episode; the seeds count up through all rounds.
+        patience: number of steps in a row, in which the expert knows no way to success, after which an episode ends.
+        eval_episodes: number of episodes in which every policy is also evaluated, the same for all.
         eval_seed: seed of the first of them.
         workers: processes that simulate.
         together: episodes that run at the same time.

@@ -26,7 +26,7 @@ from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.modality import MODALITY
 from lerobot_constructskill.demos.noise import execute
 from lerobot_constructskill.demos.settings import FRAME_PACKAGES
-from lerobot_constructskill.errors import UserError
+from lerobot_constructskill.errors import UserError, plural
 
 type Check = Callable[[DataSet], Iterator[str]]
 
@@ -75,7 +75,7 @@ def check_values(data: DataSet) -> Iterator[str]:
         if feature["dtype"] == "float32":
             finite = np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
             if not finite.all():
-                yield f"{name} is not finite in {(~finite).sum()} frames."
+                yield f"{name} is not finite in {plural((~finite).sum(), 'frame')}."
     experts = data.rounds == 0  # a learner's action is bounded by the environment alone
     limits = {"action": ACTION_SCALE, "dart.executed_action": np.where(experts, data.config.noise.clip, ACTION_SCALE)}
     for name, limit in limits.items():
@@ -85,7 +85,7 @@ def check_values(data: DataSet) -> Iterator[str]:
             yield f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
         odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED)) & (experts | (name == "action"))
         if odd.any():
-            yield f"{name} has a gripper that is neither +1 nor -1 in {odd.sum()} frames."
+            yield f"{name} has a gripper that is neither +1 nor -1 in {plural(odd.sum(), 'frame')}."
     state = data.column("observation.state")
     if np.linalg.norm(state[:, :3], axis=1).max() > REACH:
         yield f"observation.state has positions beyond the robot's reach of {REACH} m."
@@ -140,7 +140,7 @@ def check_episodes(data: DataSet) -> Iterator[str]:
     spans, rows = data.spans(), len(data.rows)
     indices = [int(data.column("episode_index")[span.start]) for span in spans]
     if indices != list(range(len(data.episodes))):
-        yield f"The rows hold episodes {_few(indices)}, the metadata {len(data.episodes)}."
+        yield f"The rows have the episodes {_few(indices)}, the metadata {len(data.episodes)}."
     for span, (_, episode) in zip(spans, data.episodes.iterrows(), strict=False):
         yield from _check_episode(data, span, f"Episode {episode['episode_index']}", episode)
     if not np.array_equal(data.column("index"), np.arange(rows)):
@@ -155,7 +155,7 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
     if not np.array_equal(data.column("frame_index")[span], np.arange(length)):
         yield f"{who} has a gap: frame_index does not count its {length} frames."
     if (episode["dataset_from_index"], episode["dataset_to_index"]) != (span.start, span.stop):
-        yield f"{who} has rows {span.start} to {span.stop}, its metadata say otherwise."
+        yield f"{who} has rows {span.start} to {span.stop}, its metadata have others."
     if len(set(data.column("sim.seed")[span])) > 1:
         yield f"{who} has frames of several seeds."
     done, success = data.column("next.done")[span], data.column("next.success")[span]
@@ -191,7 +191,7 @@ def check_duplicates(data: DataSet) -> Iterator[str]:
     frozen = still & (asked[:-1] > 0.005)
     if frozen.any():
         first = frozen.argmax() + 1
-        yield f"{frozen.sum()} frames repeat the one before although the arm was told to move, first {first}."
+        yield f"The state stays the same in {plural(frozen.sum(), 'frame')} though the arm should move, first {first}."
 
 
 def check_hold_out(data: DataSet) -> Iterator[str]:

@@ -162,7 +162,7 @@ def read_provenance(root: Path) -> Facts:
     if not (root / SIDECAR).is_file():
         raise MissingError(
             f"{root} has no {SIDECAR}, which says how it was made: only constructskill-generate writes it, and "
-            "lerobot-edit-dataset drops it when it deletes, splits or merges."
+            "lerobot-edit-dataset removes it when it deletes, splits or merges."
         )
     return read_facts(root, SIDECAR)
 

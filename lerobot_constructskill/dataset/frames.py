@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.dataset.dataset import DataSet
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 
 FLAT = 2.0
 """Standard deviation over a picture, of 255, below which nothing is seen on it."""
@@ -64,7 +64,7 @@ def _check_packets(path: Path, expected: int, name: Path) -> Iterator[str]:
         yield str(error)
         return
     if len(times) != expected:
-        yield f"{name} has {len(times)} frames, the rows of its episodes are {expected}."
+        yield f"{name} has {plural(len(times), 'frame')}, but its episodes have {expected} rows."
     elif np.abs(times - np.arange(expected) / FPS).max() > 1e-4:
         yield f"The frames of {name} are not 1/{FPS} s apart."
 
@@ -83,9 +83,12 @@ def check_pictures(data: DataSet) -> Iterator[str]:
                 frozen.append(row)
             before = picture
         if flat:
-            yield f"{len(flat)} frames of {camera} show nothing, first {flat[0]}."
+            yield f"{camera} shows nothing in {plural(len(flat), 'frame')}, first {flat[0]}."
         if frozen:
-            yield f"{len(frozen)} frames of {camera} repeat the one before while the arm moves, first {frozen[0]}."
+            yield (
+                f"{camera} repeats the frame before in {plural(len(frozen), 'frame')} while the arm moves, "
+                f"first {frozen[0]}."
+            )
 
 
 def pictures(data: DataSet, camera: str) -> Iterator[tuple[int, np.ndarray]]:

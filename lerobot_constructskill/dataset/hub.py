@@ -40,7 +40,7 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
             raise MissingError(f"There is no folder {root}.")
         return root
     if repo_id is None:
-        raise InputError("Name a data set with --repo_id, or its folder with --root.")
+        raise InputError("Give a data set's name with --repo_id, or its folder with --root.")
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
     return pull(repo_id, revision)
@@ -98,7 +98,7 @@ def _check_videos(dataset: "LeRobotDataset") -> None:
             rows[path] = rows.get(path, 0) + episode["length"]
     for path, wanted in rows.items():
         if (found := len(packet_times(path, path.relative_to(dataset.root)))) < wanted:
-            raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, its episodes have {wanted}.")
+            raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, but its episodes have {wanted}.")
 
 
 def choose_held_out(dataset: "LeRobotDataset", episodes: list[int] | None) -> list[int]:
@@ -109,7 +109,7 @@ def choose_held_out(dataset: "LeRobotDataset", episodes: list[int] | None) -> li
     """
     chosen = held_out(dataset.num_episodes) if episodes is None else episodes
     if not chosen or not set(chosen) <= set(range(dataset.num_episodes)):
-        raise InputError(f"Name held-out episodes among the {dataset.num_episodes} there are, not {chosen}.")
+        raise InputError(f"Held-out episodes must be among 0 to {dataset.num_episodes - 1}, not {chosen}.")
     return chosen
 
 

@@ -83,14 +83,14 @@ class ExpertConfig:
         threshold: distance to a phase's target at which the phase ends, in metres.
         align_tolerance: distance along the jaws within which DESCEND goes below the object's top, in metres.
         grasp_dwell: steps spent closing the gripper.
-        release_dwell: longest time spent above the bin with the gripper open, in steps.
+        release_dwell: most steps spent above the bin with the gripper open.
         pregrasp_clearance: height above the grasp at which PREGRASP ends, in metres.
         lift_height: how far LIFT rises, in metres (paper, section II).
         release_clearance: gap between the object and the bin's rim at RELEASE, in metres.
         finger_depth: how far below the object's top the finger tips grasp, in metres.
 
     Raises:
-        ValueError: a value that no demonstration can be made with.
+        ValueError: a value out of its range.
     """
 
     gain: Gain = 1.0

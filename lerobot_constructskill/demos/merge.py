@@ -29,7 +29,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     if len({attempt.light_robot for attempt in attempts}) > 1:
         raise InputError(
             "Some attempts drew the light robot and some the full one, on machines with and without a GPU: "
-            "set --light_robot and generate anew."
+            "set --light_robot and generate all of them again."
         )
     roots = [shards / str(attempt.seed) / EPISODE for attempt in attempts if attempt.success]
     with tempfile.TemporaryDirectory(dir=shards) as scratch:

@@ -23,15 +23,15 @@ class NoiseConfig:
 
     Args:
         model: `fixed`: `sigma` on every axis (paper, section II); `dart`: the fitted `covariance`; `isotropic`: as
-            strong as that covariance, but alike on every axis.
+            strong as that covariance, but equal on every axis.
         sigma: standard deviation per axis of `fixed`, in metres; 0 turns noise off.
         covariance: 3 x 3, in m2: a policy's error on held-out demonstrations, as `constructskill-fit-noise` writes it.
         fitted_on: what the covariance was fitted on, for the data set's provenance.
         clip: bound on each axis of the executed translation, in metres, with and without noise.
-        phases: names of the phases that are perturbed. GRASP and RELEASE stay clean, so that contact is not.
+        phases: names of the phases that are perturbed. GRASP and RELEASE have no noise, to keep contacts clean.
 
     Raises:
-        ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or is none.
+        ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or wrong.
     """
 
     model: Annotated[str, Among(MODELS)] = "fixed"
@@ -63,7 +63,7 @@ class NoiseConfig:
 def _check_covariance(covariance: list[list[float]]) -> None:
     matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
     if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
-        raise InputError(f"A noise covariance is a symmetric 3 x 3 matrix in m2, not {covariance}.")
+        raise InputError(f"A noise covariance must be a symmetric 3 x 3 matrix in m2, not {covariance}.")
     if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
         raise InputError(f"The noise covariance {covariance} has a negative variance.")
 

@@ -17,7 +17,7 @@ from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
-from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.errors import InputError, MachineError, plural
 from lerobot_constructskill.progress import Progress, quiet
 
 SHARDS = "shards"
@@ -98,8 +98,8 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
 def _check_failures(config: GenerateConfig, failures: int) -> None:
     if failures > config.max_failures * config.episodes:
         raise InputError(
-            f"{failures} attempts failed, more than max_failures={config.max_failures} allows for "
-            f"{config.episodes} demonstrations: check the expert's and the noise's values."
+            f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
+            f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
         )
 
 
@@ -111,6 +111,7 @@ def check_disk(config: GenerateConfig, root: Path) -> None:
     free = shutil.disk_usage(disk).free
     if free < needed:
         raise MachineError(
-            f"{disk} has {free / 1e6:,.0f} MB free and {config.episodes} episodes of up to {config.max_steps} steps "
-            f"take up to {needed / 1e6:,.0f} MB: make room, name another root, or ask for fewer."
+            f"{disk} has {free / 1e6:,.0f} MB free and {plural(config.episodes, 'episode')} of up to "
+            f"{plural(config.max_steps, 'step')} can take up to {needed / 1e6:,.0f} MB: make room, name another root, "
+            "or ask for fewer."
         )

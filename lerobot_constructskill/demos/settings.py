@@ -27,18 +27,18 @@ class GenerateConfig:
         root: folder to write; `$HF_LEROBOT_HOME/<repo_id>` by default. It must not exist.
         task: a name in `contract.TASKS`.
         episodes: successful demonstrations to record.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist view). The state is always
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera). The state is always
             recorded.
         max_steps: steps after which an attempt counts as failed.
-        max_failures: failed attempts, as a fraction of `episodes`, at which the run gives up.
+        max_failures: failed attempts, as a fraction of `episodes`, above which the run gives up.
         seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
-        light_robot: as in the environment.
-        stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or when the expert
-            has finished: the steps in which the open hand waits above the bin show when to let go.
+        light_robot: draw the robot with decimated meshes, as in the environment.
+        stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
+            expert has finished: its last steps, the open hand above the bin, show when to let go.
         labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
         expert: gains, thresholds and dwells.
         noise: what is added to the executed action.
-        workers: attempts that run at the same time. The data set does not depend on it.
+        workers: attempts that run at the same time; the data set does not depend on it.
         executor: what they run on: `processes` of this machine, or `ray` (extra `distributed`; a cluster needs `root`
             on a file system that all its machines share).
 

@@ -26,9 +26,9 @@ class ConstructSkillEnvConfig(EnvConfig):
     """ConstructSkill's tasks for `lerobot-train` and `lerobot-eval`.
 
     Args:
-        task: a name in `contract.TASKS` or in `contract.SUITES`, or several with commas between; their actions must
-            be alike.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the 8-number
+        task: a name in `contract.TASKS` or in `contract.SUITES`, or several separated by commas, whose actions
+            must be the same.
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the 8-number
             state, for policies that need them).
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
@@ -36,8 +36,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu" or "cpu".
         vectorization: "process" (a simulator for each environment) or "native" (one for all, which needs a GPU for
             more than one environment).
-        perturb: `axis=level` with commas between, as `perturbations.AXES` lists them, such as `camera=2,light=1`; the
-            names under which LeRobot keeps the results end in it.
+        perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them, such as `camera=2,light=1`;
+            LeRobot keeps the results under names that end in it.
         perturb_seed: seed of what a perturbation draws once.
     """
 
@@ -70,7 +70,7 @@ class ConstructSkillEnvConfig(EnvConfig):
         if self.max_parallel_tasks != 1:
             raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
         if self.vectorization == "native" and self.perturb:
-            raise InputError("Perturbations are drawn for each environment apart; use vectorization=process for them.")
+            raise InputError("Each environment draws its own perturbation; use vectorization=process with them.")
         rows = [row for suite in select_tasks(self.task).values() for row in suite]
         for row in rows:
             self._make_env(row.name)  # refuses what no environment can be made with

@@ -54,12 +54,12 @@ class ConstructSkillEnv(gym.Env):
 
     Args:
         task: a name in `contract.TASKS`.
-        obs_type: `pixels` (the paper's sole view) or `pixels_agent_pos` (adds the wrist camera and the state).
+        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu", "cpu", or "none": physics alone, ten
             times as fast, with no camera in the observation; for checking experts.
-        perturb: `axis=level` with commas between, as `perturbations.AXES` lists them; empty for none.
+        perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them; empty for none.
         perturb_seed: seed of what a perturbation draws once.
 
     Raises:

@@ -147,7 +147,7 @@ def read_recordings(path: Path) -> list[Recording]:
     except pa.ArrowInvalid as error:
         raise InputError(f"'{path}' cannot be read: {error}") from None
     if not table.schema.equals(SCHEMA):
-        raise InputError(f"'{path}' is no recording of this version.")
+        raise InputError(f"'{path}' is not a recording of this version.")
     flat = [np.asarray(actions.values) for actions in table["actions"]]
     rows = table.drop_columns("actions").to_pylist()
     return [Recording(**row, actions=[actions]) for row, actions in zip(rows, flat, strict=True)]

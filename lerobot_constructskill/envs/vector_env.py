@@ -36,7 +36,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
 
     def __init__(self, n_envs: int, **kwargs: Any):
         if os.environ.get(FOLDER):
-            raise InputError(f"${FOLDER} records one environment a simulator; use vectorization=process with it.")
+            raise InputError(f"${FOLDER} records one environment per simulator only; use vectorization=process.")
         self._single = ConstructSkillEnv(**kwargs)
         self.num_envs = n_envs
         self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}

@@ -107,7 +107,7 @@ def join_feature_sets(
     key = feature_key(camera)
     pooled = [np.stack(part.hf_dataset.with_format("numpy")[key][:]) for part in parts]
     if sum(map(len, pooled)) != dataset.num_frames:
-        raise InputError(f"The parts of '{dataset.repo_id}' have other frames than its {dataset.num_frames}.")
+        raise InputError(f"The parts of '{dataset.repo_id}' do not add up to its {dataset.num_frames} frames.")
     with room_for(folder):
         _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder)
         if patches:

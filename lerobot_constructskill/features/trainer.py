@@ -24,7 +24,7 @@ from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load
 
 
 class FeatureTrainer:
-    """`study.trainers.Trainer` of frozen_vit."""
+    """`training.trainers.Trainer` of frozen_vit."""
 
     seeds_together = True
     places = ("backbone_path", "backbone_source")
@@ -120,7 +120,7 @@ def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDatas
     spec, patches = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].reads_patches
     if config.backbone_sha256 is None:
         load_weights(spec, config.backbone_path)  # says what was tried
-        raise MissingWeightsError(f"The weights of {config.backbone} came while the study ran: start it again.")
+        raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)

@@ -97,7 +97,7 @@ def _receive(worker: Connection) -> dict[int, Any]:
     try:
         return worker.recv()
     except (EOFError, ConnectionError):
-        raise MachineError("A simulator's process died; run fewer at once if memory was short.") from None
+        raise MachineError("A simulator's process died; if there was not enough memory, run fewer at once.") from None
 
 
 def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:

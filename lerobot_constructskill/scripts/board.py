@@ -1,19 +1,20 @@
-"""`constructskill-board`: the board's pages from a folder of submissions."""
+"""`constructskill-board`: make the board's pages from a folder of submissions."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import RepoId, check
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
 class BoardConfig:
-    """Write a page a suite, board.parquet, and exports for LeRobot, the Hub and vla-evaluation-harness."""
+    """Write a page for each suite, board.parquet, and exports for LeRobot, the Hub and vla-evaluation-harness."""
 
     root: Path  # the board's folder, with entries/ and verified/
     out: Path = Path("outputs/board")  # folder to write
-    dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; with it .eval_results are written too
+    dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 
     def __post_init__(self):
         check(self)
@@ -29,7 +30,7 @@ def board(config: BoardConfig) -> str:
     from lerobot_constructskill.board.site import write_board
 
     pages = write_board(config.root, config.out, config.dataset_id)
-    return f"{len(pages)} pages written; open {pages[-1]}"
+    return f"{plural(len(pages), 'page')} written; open {pages[-1]}"
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`constructskill-card`: a data set's card and its two pictures, into its folder, from where they are pushed."""
+"""`constructskill-card`: write a data set's card and its two pictures into its folder."""
 
 import json
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ class CardConfig:
     """Write README.md, pictures/contact_sheet.png and pictures/trajectories.png for a data set."""
 
     root: Path  # the data set's folder
-    repo_id: RepoId | None = None  # its name on the Hub; the one it was generated under when left out
-    out: Path | None = None  # where to write; into root when left out
+    repo_id: RepoId | None = None  # its name on the Hub; default: the one it was generated under
+    out: Path | None = None  # folder to write; default: root
     facts: Path | None = None  # also write the card's facts as JSON here
 
     def __post_init__(self):

@@ -1,18 +1,18 @@
-"""`constructskill-check`: is a data set, here or on the Hub, what it says it is? One line for each check."""
+"""`constructskill-check`: check a data set, here or on the Hub; one line for each check."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import RepoId, Text, check
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
 class CheckConfig:
-    """Check a data set of demonstrations; exit status 1 where something is wrong."""
+    """Check a data set of demonstrations; exit status 1 if something is wrong."""
 
-    repo_id: RepoId | None = None  # its name; pulled from the Hub unless root is given
+    repo_id: RepoId | None = None  # its name; downloaded from the Hub unless root is given
     root: Path | None = None  # its folder
     revision: Text | None = None  # tag, branch or commit on the Hub
 
@@ -41,7 +41,8 @@ def check_dataset(config: CheckConfig) -> str:
             print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
     if wrong:
         raise InputError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
-    return f"{len(data.episodes)} demonstrations, {len(data.rows)} frames: {len(CHECKS)} checks, nothing wrong."
+    size = f"{plural(len(data.episodes), 'demonstration')}, {plural(len(data.rows), 'frame')}"
+    return f"{size}: {len(CHECKS)} checks, nothing wrong."
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`constructskill-check-task`: what a new task owes: its tests, its expert's success, and a sheet to look at."""
+"""`constructskill-check-task`: check a new task: its tests, its expert's success, and a contact sheet to look at."""
 
 import subprocess
 import sys
@@ -27,7 +27,7 @@ class CheckTaskConfig:
         ValueError: there is no such task, the counts are out of range, or the task fails its check.
     """
 
-    task: str
+    task: str  # a name in `contract.TASKS`
     states: Count = 100  # random initial states, without rendering
     noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
     expert: ExpertConfig = field(default_factory=ExpertConfig)
@@ -54,7 +54,7 @@ def check_task(config: CheckTaskConfig) -> str:
     if len(failures) > (1 - REQUIRED) * config.states:
         raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
     if config.tests and (code := run_tests(config.task)):
-        raise InputError(f"{report} Its tests failed with status {code}; pytest tells why above.")
+        raise InputError(f"{report} Its tests failed with status {code}; the output of pytest above says why.")
     return report
 
 

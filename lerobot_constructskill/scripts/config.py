@@ -1,4 +1,4 @@
-"""`constructskill-config`: the configurations that are shipped, and the path of one, for `lerobot-train`."""
+"""`constructskill-config`: list this package's configurations, or print the path of one, for `lerobot-train`."""
 
 import argparse
 
@@ -18,7 +18,7 @@ def show(name: str | None = None) -> str:
         width = max(map(len, shipped))
         return "\n".join(f"{one:<{width}}  {description(path)}" for one, path in shipped.items())
     if name not in shipped:
-        raise MissingError(f"There is no configuration '{name}'; there are: {', '.join(shipped)}.")
+        raise MissingError(f"There is no configuration '{name}'; the configurations are: {', '.join(shipped)}.")
     return str(shipped[name])
 
 

@@ -14,7 +14,7 @@ from lerobot_constructskill.errors import InputError, UserError, full_traceback,
 from lerobot_constructskill.presets import find, names
 
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
-"""Exit statuses: the user's to mend; a defect of ours; Ctrl-C."""
+"""Exit statuses: something the user can fix; a fault of this package; Ctrl-C."""
 
 DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
@@ -40,12 +40,12 @@ def _put_file(flags: list[str], kind: str) -> list[str]:
         return flags
     name, *others = flags
     if any(flag.split("=")[0] == "--config_path" for flag in others):
-        raise InputError(f"'{name}' and --config_path are two configurations; give one of them.")
+        raise InputError(f"'{name}' and --config_path are two configurations; give only one.")
     return [f"--config_path={find(kind, name)}", *others]
 
 
 def _tell_names(kind: str) -> str:
-    return f"The first argument, in place of --config_path, can be a file or one of these: {', '.join(names(kind))}."
+    return f"Instead of --config_path, the first argument can be a file or a name: {', '.join(names(kind))}."
 
 
 @contextmanager
@@ -85,8 +85,8 @@ def _judge(error: BaseException) -> tuple[int, str]:
     if isinstance(error, UserError | OSError):
         return REFUSED, said
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lerobot_constructskill"):
-        return REFUSED, remedy_of(error) or f"{said}; constructskill-doctor tells what is not installed"
-    return FAULT, f"this is a fault of ours, not of your input: {type(error).__name__}: {said}"
+        return REFUSED, remedy_of(error) or f"{said}; constructskill-doctor says what is not installed"
+    return FAULT, f"this is a fault of constructskill, not of your input: {type(error).__name__}: {said}"
 
 
 def _keep(name: str, entry: str) -> Path | None:

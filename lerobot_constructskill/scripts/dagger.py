@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import run
 
 
@@ -11,7 +12,7 @@ def dagger(config: DaggerConfig) -> str:
 
     Raises:
         FileExistsError: the root exists already, or another process is writing it.
-        ValueError: nothing can be made of a field.
+        ValueError: a field cannot be used.
         OSError: the disk is full, this machine cannot render, or a process died.
     """
     import lerobot_constructskill.plugin  # noqa: F401
@@ -26,7 +27,8 @@ def dagger(config: DaggerConfig) -> str:
     lines = run_dagger(
         Plan(config), Store(config.store.absolute()), root.absolute(), lambda line: print(line, flush=True)
     )
-    return f"{len(lines)} policies, {lines[-1].frames} frames: {root}/dataset, {root}/checkpoint"
+    size = f"{plural(config.rounds, 'round')}, {plural(lines[-1].frames, 'frame')}"
+    return f"{size}: {root}/dataset, {root}/checkpoint"
 
 
 def main() -> None:

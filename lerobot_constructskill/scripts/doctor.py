@@ -1,4 +1,4 @@
-"""`constructskill-doctor`: names what is wrong on a machine, one line for each check."""
+"""`constructskill-doctor`: say what is wrong with a machine; one line for each check."""
 
 import argparse
 import shutil
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable
 from importlib import metadata
 
-from lerobot_constructskill.errors import DISTRIBUTION, InputError
+from lerobot_constructskill.errors import DISTRIBUTION, InputError, plural
 from lerobot_constructskill.scripts.console import EPILOG, edge
 from lerobot_constructskill.scripts.doctor_checks import (
     Finding,
@@ -166,7 +166,7 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
         levels.append(finding.level)
         print(f"{finding.level:<4}  {finding.name:<17}  {finding.message}", flush=True)
     failed, warned = levels.count(Level.FAIL), levels.count(Level.WARN)
-    print(f"{len(levels)} checks, {failed} failed, {warned} warned.")
+    print(f"{plural(len(levels), 'check')}, {failed} failed, {warned} warned.")
     return int(failed > 0)
 
 

@@ -54,9 +54,9 @@ class Probe:
 def judge_python(version: tuple[int, int]) -> Finding:
     text = ".".join(map(str, version))
     if version < PYTHONS[0]:
-        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12: make an environment with that.")
+        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12: make an environment with Python 3.12.")
     if version not in PYTHONS:
-        return Finding(Level.WARN, "Python", f"{text} is newer than the 3.12 and 3.13 this was tested with.")
+        return Finding(Level.WARN, "Python", f"{text} is newer than 3.12 and 3.13, which were tested.")
     return Finding(Level.OK, "Python", text)
 
 
@@ -68,7 +68,7 @@ def judge_name(names: Sequence[str]) -> Finding:
         return Finding(
             Level.FAIL,
             "Distribution",
-            f"its name has hyphens, which LeRobot does not find; {REINSTALL}.",
+            f"its name has hyphens, so LeRobot does not find it; {REINSTALL}.",
         )
     return Finding(Level.FAIL, "Distribution", f"it is not installed; {REINSTALL}.")
 
@@ -96,7 +96,9 @@ def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) ->
         return Finding(Level.FAIL, "Versions", f"{', '.join(wrong)}; pip install {' '.join(wanted)}.")
     if absent:
         extra = ",".join(sorted(absent))
-        return Finding(Level.WARN, "Versions", f"without the extra [{extra}]; pip install '{DISTRIBUTION}[{extra}]'.")
+        return Finding(
+            Level.WARN, "Versions", f"the extra [{extra}] is not installed; pip install '{DISTRIBUTION}[{extra}]'."
+        )
     return Finding(Level.OK, "Versions", ", ".join(right))
 
 
@@ -122,20 +124,22 @@ def judge_mesa(version: str | None, gpu: bool) -> Finding:
         return Finding(
             Level.WARN,
             "Mesa",
-            f"no Debian package mesa-vulkan-drivers; where Vulkan fails below, {RENDERER}, {wanted} or newer.",
+            f"no Debian package mesa-vulkan-drivers; if Vulkan fails below, {RENDERER}, {wanted} or newer.",
         )
     if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
         return Finding(
             Level.FAIL,
             "Mesa",
-            f"{version}, but lavapipe renders for SAPIEN from {wanted} on; {RENDERER}.",
+            f"{version}, but SAPIEN can use lavapipe only from {wanted} on; {RENDERER}.",
         )
     return Finding(Level.OK, "Mesa", str(version))
 
 
 def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
     if not simulator:
-        return Finding(Level.WARN, "Vulkan", f"not tried without sapien; pip install '{DISTRIBUTION}[sim]'.")
+        return Finding(
+            Level.WARN, "Vulkan", f"not tried, because sapien is not installed; pip install '{DISTRIBUTION}[sim]'."
+        )
     if not probe.ok:
         return Finding(
             Level.FAIL,
@@ -163,7 +167,9 @@ def judge_ffmpeg(probe: Probe) -> Finding:
     package = re.search(r"libpython\d\.\d+", probe.reason)
     missing = package[0] if package else "ffmpeg"
     return Finding(
-        Level.WARN, "FFmpeg", f"torchcodec finds no {missing}, LeRobot decodes with PyAV; apt-get install {missing}."
+        Level.WARN,
+        "FFmpeg",
+        f"torchcodec does not find {missing}, so LeRobot decodes with PyAV; apt-get install {missing}.",
     )
 
 
@@ -171,7 +177,7 @@ def judge_weights(probe: Probe) -> Finding:
     """Judge lines of "backbone<tab>source", the source empty where there is none."""
     if not probe.ok:
         return Finding(
-            Level.FAIL, "Weights", f"could not be looked for ({probe.reason}); mend what fails above first."
+            Level.FAIL, "Weights", f"the search for them failed ({probe.reason}); fix what fails above first."
         )
     sources = dict(line.partition("\t")[::2] for line in probe.out.splitlines())
     found = ", ".join(f"{name} ({source})" for name, source in sources.items() if source)
@@ -196,12 +202,12 @@ def judge_fetched(name: str, probe: Probe) -> Finding:
 def judge_encoder(probe: Probe) -> Finding:
     """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
     if not probe.ok:
-        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); mend what fails above first.")
+        return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); fix what fails above first.")
     precision, runtime, device, speed = probe.out.split()
     expected = (
         f"backbone_precision=auto is {precision} here, {float(speed):.0f} images/s of dinov2_vits14 by {runtime} on "
         f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for 50 demonstrations"
     )
     if (runtime, device) == ("torch", "cpu"):
-        return Finding(Level.WARN, "Encoder", f"{expected}; pip install '{DISTRIBUTION}[cpu]' to be faster.")
+        return Finding(Level.WARN, "Encoder", f"{expected}; pip install '{DISTRIBUTION}[cpu]' to make it faster.")
     return Finding(Level.OK, "Encoder", expected)

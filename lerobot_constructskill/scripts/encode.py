@@ -1,4 +1,4 @@
-"""`constructskill-encode`: run a frozen encoder once over a data set, so that training never does."""
+"""`constructskill-encode`: run a frozen encoder once over a data set, so that training need not."""
 
 import re
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ class EncodeConfig:
     """
 
     repo_id: RepoId  # the data set to encode
-    root: Path | None = None  # its folder; LeRobot's cache when left out
+    root: Path | None = None  # its folder; default: LeRobot's cache
     out_repo_id: RepoId | None = None  # default: <repo_id>_<backbone>
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # an entry of `backbones.BACKBONES`, timm/<model>, or hf/<owner>/<name>
     backbone_path: Text | None = None  # folder or file with the weights; else the Hub, then the [offline] packages
-    backbone_precision: str = "auto"  # the fastest that the device does natively; or float32 or bfloat16 by name
+    backbone_precision: str = "auto"  # auto is the fastest that the device has natively; or float32, bfloat16
     camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
-    batch_size: BatchSize = 16
-    device: Device | None = None  # default: a GPU where there is one
+    batch_size: BatchSize = 16  # images at a time
+    device: Device | None = None  # default: a GPU if there is one
 
     def __post_init__(self):
         check(self)

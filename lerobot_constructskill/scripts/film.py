@@ -1,4 +1,4 @@
-"""`constructskill-film`: the scripted expert at work, as a video."""
+"""`constructskill-film`: film the scripted expert of a task."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,7 +9,7 @@ from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.scripts.console import run
 
-VIEWS = ("close", "policy")
+View = Annotated[str, Among(("close", "policy"))]
 
 
 @dataclass
@@ -17,11 +17,11 @@ class FilmConfig:
     """Film the scripted expert of a task in one episode."""
 
     task: str = "brick_to_bin"  # a name in `contract.TASKS`
-    out: Path | None = None  # the video; outputs/<task>.mp4 when left out
-    view: Annotated[str, Among(VIEWS)] = "close"  # from close by, or what the policy's camera sees
+    out: Path | None = None  # the video; default: outputs/<task>.mp4
+    view: View = "close"  # a close-up (close), or what the policy sees (policy)
     seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
     noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))  # none by default
-    perturb: str = ""  # axis=level with commas between, as in the environment
+    perturb: str = ""  # axis=level, separated by commas, as in the environment
 
     def __post_init__(self):
         check(self)

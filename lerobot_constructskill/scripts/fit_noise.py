@@ -1,10 +1,11 @@
-"""`constructskill-fit-noise`: one DART iteration, from a policy and held-out demonstrations to a new generation."""
+"""`constructskill-fit-noise`: one DART iteration: fit the noise of the next data set to a policy's errors."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from lerobot_constructskill.bounds import Device, Episodes, Range, RepoId, Text, check
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import run
 
 Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
@@ -12,16 +13,16 @@ Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
 
 @dataclass
 class FitNoiseConfig:
-    """Write the configuration of the next data set: that of the given one, with the noise fitted to a policy."""
+    """Write the configuration of the next data set: that of the given set, with noise that is fitted to a policy."""
 
     policy_path: Text  # a checkpoint's `pretrained_model` folder, or a name on the Hub
     repo_id: RepoId  # the demonstrations, with their images and phases
     out: Path  # YAML to write, for constructskill-generate
-    root: Path | None = None  # the demonstrations' folder; LeRobot's cache when left out
-    episodes: Episodes | None = None  # held-out episodes; every eighth when left out
-    alpha: Alpha | None = None  # scale to this sum of squared errors an episode, in m2; as measured when left out
-    device: Device | None = None  # default: a GPU where there is one
-    backbone_precision: Text | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+    root: Path | None = None  # the demonstrations' folder; default: LeRobot's cache
+    episodes: Episodes | None = None  # held-out episodes; default: every eighth
+    alpha: Alpha | None = None  # scale to this sum of squared errors per episode, in m2; default: as measured
+    device: Device | None = None  # default: a GPU if there is one
+    backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's
 
     def __post_init__(self):
         check(self)
@@ -70,7 +71,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     config.out.write_text(f"# DART iteration {fitted_on['iteration']}.\n{yaml.safe_dump(generator, sort_keys=False)}")
     deviations = ", ".join(f"{1000 * value:.2f}" for value in np.sqrt(np.diag(covariance)))
-    return f"Noise of {deviations} mm (x, y, z) from {fitted_on['frames']} frames: {config.out}"
+    return f"Noise of {deviations} mm (x, y, z) from {plural(int(fitted_on['frames']), 'frame')}: {config.out}"
 
 
 def main() -> None:

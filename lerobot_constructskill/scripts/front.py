@@ -43,7 +43,7 @@ def find(name: str) -> metadata.EntryPoint:
     """
     found = commands().get(name.removeprefix(PREFIX))
     if found is None:
-        raise InputError(f"There is no command '{name}'; there are: {', '.join(commands())}.")
+        raise InputError(f"There is no command '{name}'; the commands are: {', '.join(commands())}.")
     return found
 
 

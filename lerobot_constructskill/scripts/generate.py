@@ -1,7 +1,7 @@
-"""`constructskill-generate`: scripted demonstrations into a LeRobotDataset."""
+"""`constructskill-generate`: make scripted demonstrations as a LeRobotDataset."""
 
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
-from lerobot_constructskill.errors import remedy_of
+from lerobot_constructskill.errors import plural, remedy_of
 from lerobot_constructskill.scripts.console import run
 
 
@@ -14,8 +14,8 @@ def generate(config: GenerateConfig) -> str:
     except ModuleNotFoundError as error:  # the demonstrations are whole; constructskill-card writes it later
         print(f"No card: {remedy_of(error) or error}", flush=True)
     return (
-        f"{summary.episodes} demonstrations, {summary.frames} frames, {len(summary.discarded_seeds)} attempts "
-        f"discarded: {summary.root}"
+        f"{plural(summary.episodes, 'demonstration')}, {plural(summary.frames, 'frame')}, "
+        f"{plural(len(summary.discarded_seeds), 'attempt')} discarded: {summary.root}"
     )
 
 

@@ -1,4 +1,4 @@
-"""`constructskill-offline`: what any LeRobot policies predict on held-out demonstrations, a row a checkpoint."""
+"""`constructskill-offline`: errors of any LeRobot policies on held-out demonstrations, a row for each checkpoint."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -10,7 +10,7 @@ from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import SPEC
 from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
-from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.errors import MissingError, plural
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.scripts.console import run
 
@@ -23,14 +23,14 @@ class OfflineConfig:
 
     policies: Patterns  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
     repo_id: RepoId  # the demonstrations
-    root: Path | None = None  # their folder; LeRobot's cache, or the Hub, when left out
+    root: Path | None = None  # their folder; default: LeRobot's cache, or the Hub
     revision: Text | None = None  # tag, branch or commit on the Hub
-    episodes: Episodes | None = None  # held-out demonstrations; every eighth when left out
+    episodes: Episodes | None = None  # held-out demonstrations; default: every eighth
     out: Path = Path("outputs/offline")  # folder for offline.json and offline.parquet
     batch_size: BatchSize = 32  # frames at a time
     seed: Seed = 0  # of policies that sample their actions
     device: Device | None = None  # default: that of the checkpoint
-    backbone_precision: Text | None = None  # of frozen_vit, where this machine would emulate the checkpoint's own
+    backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's
 
     def __post_init__(self):
         check(self)
@@ -126,7 +126,7 @@ def _write(rows: list[dict], folder: Path) -> str:
     with replaced(folder / "offline.parquet") as partial:
         table.to_parquet(partial, index=False)
     shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
-    return f"{shown}\n{rows[0]['frames']} frames; every column: {folder / 'offline.json'} and .parquet"
+    return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {folder / 'offline.json'} and .parquet"
 
 
 def main() -> None:

@@ -1,24 +1,24 @@
-"""`constructskill-push`: a data set onto the Hub, checked before it leaves the machine."""
+"""`constructskill-push`: check a data set and upload it to the Hub."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import RepoId, Word, check
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
 class PushConfig:
-    """Check a data set, write its card where it has none, put it on the Hub in one commit and tag it.
+    """Check a data set, write its card if it has none, upload it to the Hub as one commit and tag it.
 
-    Interrupted, the same command continues.
+    After an interruption the same command continues.
     """
 
     repo_id: RepoId  # its name on the Hub, user/name
     root: Path  # its folder
     private: bool = False  # whether only its owner sees it
-    tag: Word | None = None  # a version of its own, beside LeRobot's tag
+    tag: Word | None = None  # a version tag of yours, beside LeRobot's tag
     update: bool = False  # replace a data set that is there already
 
     def __post_init__(self):
@@ -44,7 +44,9 @@ def push_dataset(config: PushConfig) -> str:
     checks = Progress(CHECKS.items(), "check", unit="check")
     wrong = [f"{name}: {complaint}" for name, check in checks for complaint in complaints(data, check)]
     if wrong:
-        raise InputError(f"{config.root} is not pushed, because of {len(wrong)} complaints; {wrong[0]}")
+        raise InputError(
+            f"{config.root} is not pushed, because the checks found {plural(len(wrong), 'fault')}; {wrong[0]}"
+        )
     if not (config.root / "README.md").is_file():
         print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"

@@ -1,4 +1,4 @@
-"""`constructskill-push-policy`: a trained policy onto the Hub by LeRobot's own push, its outcomes on the card."""
+"""`constructskill-push-policy`: upload a trained policy to the Hub by LeRobot's own push, outcomes on its card."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +12,12 @@ from lerobot_constructskill.scripts.console import run
 
 @dataclass
 class PushPolicyConfig:
-    """Push a checkpoint with LeRobot's card and, on it, lift and place counts of every evaluated training seed."""
+    """Upload a checkpoint; its card also has the lifts and placements of every evaluated training seed."""
 
     policy_path: Path  # a checkpoint's `pretrained_model` folder
     evaluations: Path  # folder of seed_*/eval_info.json, as lerobot-eval writes them
     repo_id: RepoId  # its name on the Hub, user/name
-    task: str  # what it was evaluated in, as `--env.task`
+    task: str  # the task of its evaluation, as `--env.task`
     private: bool = False  # whether only its owner sees it
 
     def __post_init__(self):

@@ -4,18 +4,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import Episodes, RepoId, Text, check
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
 class ReplayConfig:
-    """Replay a data set in the simulator; exit status 1 where an outcome differs."""
+    """Replay a data set in the simulator; exit status 1 if an outcome differs."""
 
-    repo_id: RepoId | None = None  # its name; pulled from the Hub unless root is given
+    repo_id: RepoId | None = None  # its name; downloaded from the Hub unless root is given
     root: Path | None = None  # its folder
     revision: Text | None = None  # tag, branch or commit on the Hub
-    episodes: Episodes | None = None  # which to replay; all when left out
+    episodes: Episodes | None = None  # which to replay; default: all
 
     def __post_init__(self):
         check(self)
@@ -39,7 +39,7 @@ def replay_all(config: ReplayConfig) -> str:
     everything = range(len(data.episodes))
     episodes = list(everything) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(everything):
-        raise InputError(f"Name episodes among the {len(everything)} there are, not {episodes}.")
+        raise InputError(f"episodes must be among 0 to {len(everything) - 1}, not {episodes}.")
     added, phases = 1000 * data.column("dart.noise"), data.column("phase")
     for phase in Phase:
         noise = added[phases == phase]
@@ -47,9 +47,10 @@ def replay_all(config: ReplayConfig) -> str:
     replays = {episode: replay(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:
-        raise InputError(f"{len(different)} of {len(replays)} ended otherwise than recorded: {', '.join(different)}.")
+        raise InputError(f"{len(different)} of {len(replays)} did not end as recorded: {', '.join(different)}.")
     deviation = max(one.deviation for one in replays.values())
-    return f"{len(replays)} demonstrations ended as recorded; no state is further than {deviation:.2g} from its own."
+    ended = f"{plural(len(replays), 'demonstration')} ended as recorded"
+    return f"{ended}; the largest deviation from a recorded state is {deviation:.2g}."
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""`constructskill-report`: tables, figures and a page from the rows of a study."""
+"""`constructskill-report`: make tables, figures and a page from the rows of a study."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ class ReportConfig:
     provenance.json, one JSON object of names and values to show. A study need not be complete.
     """
 
-    root: Path
+    root: Path  # the study's folder
 
     def __post_init__(self):
         check(self)

@@ -1,25 +1,25 @@
-"""`constructskill-study`: a whole study, per training seed, from one file."""
+"""`constructskill-study`: run a whole study, per training seed, from one file."""
 
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.bounds import Count
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.study.spec import Options, Study
 
 
 @dataclass(frozen=True)
 class StudyConfig(Options, Study):
-    """Make what is missing of a study, and keep what is there; a killed study goes on with the same command.
+    """Make what is missing of a study and keep what exists; after a kill the same command continues.
 
     Args:
-        analysis: labels, order, comparisons and their level; the report alone reads them.
+        analysis: labels, order, comparisons and their level; only the report reads them.
         root: the study's folder, `outputs/study/<name>` by default: study.yaml, rows.parquet and videos.
         store: where demonstrations, features, checkpoints and runs are made, each once for all studies.
         seeds: cut every variant and reference to this many seeds.
-        status: make nothing; say what is there, missing and failed, and why.
+        status: make nothing; say which runs exist, which are missing, and which failed and why.
     """
 
     analysis: Analysis = field(default_factory=Analysis)
@@ -45,11 +45,11 @@ class StudyConfig(Options, Study):
 
 
 def study(config: StudyConfig) -> str:
-    """Run a study, or look at one, and return what is to be said of it.
+    """Run a study, or look at one, and return a line about it.
 
     Raises:
         FileExistsError: another process is running it.
-        ValueError: nothing can be run with a field of the study, or not one run succeeded.
+        ValueError: a field of the study cannot be used, or no run succeeded.
     """
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.lerobot_internals import register_third_party_plugins
@@ -68,10 +68,10 @@ def study(config: StudyConfig) -> str:
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
-        raise InputError(f"All {made} runs failed, the first with: {table.episodes(failed[0])[0].error}")
+        raise InputError(f"No run succeeded; the first of {made} failed with: {table.episodes(failed[0])[0].error}")
     lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
     left = f", {len(missing)} missing" if missing else ""
-    return f"{made} runs{lacking}{left}: {root} (next: constructskill-report --root={root})"
+    return f"{plural(made, 'run')}{lacking}{left}: {root} (next: constructskill-report --root={root})"
 
 
 def _text(config: StudyConfig) -> str:

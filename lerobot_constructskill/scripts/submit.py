@@ -1,4 +1,4 @@
-"""`constructskill-submit`: a submission for the board from what was recorded."""
+"""`constructskill-submit`: make a submission for the board from recorded episodes."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,8 +6,10 @@ from typing import Annotated
 
 from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.bounds import Among, Text, check
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
+
+Suite = Annotated[str, Among(tuple(SUITES))]
 
 
 @dataclass
@@ -18,20 +20,20 @@ class SubmitConfig:
     `recorded/seed_<training seed>`.
     """
 
-    suite: Annotated[str, Among(tuple(SUITES))]  # whose settings and starts it is of
-    about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; url and notes if wanted
+    suite: Suite  # its settings and starts are evaluated
+    about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; optional: url and notes
     root: Path  # the folder to write
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed
     study: Path | None = None  # or a study's folder
-    variant: Text | None = None  # and the variant of it
+    variant: Text | None = None  # and the study's variant
     store: Path = Path("outputs/store")  # where the study's runs are
-    settings: Path | None = None  # YAML of settings other than the suite's; the submission is then a custom one
+    settings: Path | None = None  # YAML of settings other than the suite's: the submission is then a custom one
     failures: dict[str, str] = field(default_factory=dict)  # training seed to why its missing episodes failed
 
     def __post_init__(self):
         check(self)
         if (self.recorded is None) == (self.study is None) or (self.study is None) != (self.variant is None):
-            raise InputError("Name what it is made of: --recorded, or --study with --variant.")
+            raise InputError("Give what the submission is made from: --recorded, or --study with --variant.")
         if bad := [seed for seed in self.failures if not (seed.isdecimal() and len(seed) < 10)]:
             raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
 
@@ -59,8 +61,9 @@ def submit(config: SubmitConfig) -> str:
     made = collect.submit(config.root, about, config.suite, settings, piles, failures)
     size = (config.root / EPISODES).stat().st_size
     return (
-        f"{config.root}: {made.declaration.settings_class}, {len(made.claims)} episodes of "
-        f"{len(made.declaration.training_seeds)} training seeds, {size / 1e6:.2f} MB; now constructskill-verify."
+        f"{config.root}: {made.declaration.settings_class}, {plural(len(made.claims), 'episode')} of "
+        f"{plural(len(made.declaration.training_seeds), 'training seed')}, "
+        f"{size / 1e6:.2f} MB; now constructskill-verify."
     )
 
 

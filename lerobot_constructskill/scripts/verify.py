@@ -1,11 +1,11 @@
-"""`constructskill-verify`: open a submission, execute its actions again, and say what is not as it claims."""
+"""`constructskill-verify`: execute the actions of a submission again, and say which outcomes are not as claimed."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import Count, Text, Workers, check
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
 SHOWN = 10
@@ -14,21 +14,21 @@ SHOWN = 10
 
 @dataclass
 class VerifyConfig:
-    """Verify a submission; exit status 1 where it does not hold. It needs neither GPU, renderer nor policy."""
+    """Verify a submission; exit status 1 if an outcome is not as claimed. It needs no GPU, renderer or policy."""
 
     root: Path  # the submission's folder
-    sample: Count | None = None  # replay so many episodes, drawn at random; all when left out
-    workers: Workers | None = None  # processes; one per core when left out
+    sample: Count | None = None  # number of episodes to replay, drawn at random; default: all
+    workers: Workers | None = None  # processes; default: one per core
     record: Path | None = None  # folder to write the verdict to, for the board
-    value: Text | None = None  # public random number, published after the submission: say from where to run it anew
-    rerun: Path | None = None  # a submission from those starts: verify it too, and set it beside the first
+    value: Text | None = None  # public random number, newer than the submission: print how to make a re-run
+    rerun: Path | None = None  # a submission from those starts: verify it too, and compare the two
 
     def __post_init__(self):
         check(self)
         if self.rerun is not None and self.value is None:
-            raise InputError("--rerun needs the public random number that its starts come from: --value.")
+            raise InputError("--rerun needs --value, the public random number that its starts come from.")
         if self.record is not None and self.sample is not None:
-            raise InputError("A verdict is of all episodes: --record goes without --sample.")
+            raise InputError("A verdict is about all episodes: --record cannot be combined with --sample.")
 
 
 def verify(config: VerifyConfig) -> str:
@@ -47,7 +47,7 @@ def verify(config: VerifyConfig) -> str:
     verdict = _replayed(submission, config)
     told = (
         f"{config.root} holds: {verdict.replayed} of {len(submission.claims)} episodes replayed "
-        f"({verdict.steps} steps), each ended as claimed; {verdict.failed} failed with an error."
+        f"({plural(verdict.steps, 'step')}), each ended as claimed; {verdict.failed} failed with an error."
     )
     facts = {"submission": submission.sha256, "level": "replayed", "versions": verdict.versions}
     if config.rerun is not None:

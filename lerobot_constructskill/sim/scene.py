@@ -87,7 +87,7 @@ class PickPlaceEnv(BaseEnv):
       consecutive steps.
 
     Args:
-        cameras: names of the cameras in `contract.CAMERAS` to observe with; the paper's sole view by default.
+        cameras: names of the cameras in `contract.CAMERAS` to observe with; the base camera by default.
         light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
         robot_uids: ManiSkill's; the Panda by default, drawn as `light_robot` says.
         perturbation: what differs from the task as it is; nothing by default.
@@ -137,14 +137,14 @@ class PickPlaceEnv(BaseEnv):
         self.draws = Draws(perturbation or Perturbation())
         if self.draws.perturbation.amount("size"):
             if not self.is_brick:
-                raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has none.")
+                raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
             self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
         elif render_backend == "gpu" and best_render_backend() != "gpu":
             raise MachineError(
                 "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
-                "`constructskill-doctor` tells what is missing."
+                "`constructskill-doctor` says what is missing."
             )
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
@@ -165,7 +165,7 @@ class PickPlaceEnv(BaseEnv):
             if not any(word in str(error).lower() for word in NO_DEVICE):
                 raise
             raise MachineError(
-                f"No Vulkan device to render with ({error}); `constructskill-doctor` tells what is missing."
+                f"There is no Vulkan device to render with ({error}); `constructskill-doctor` says what is missing."
             ) from None
 
     @property

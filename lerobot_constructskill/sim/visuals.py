@@ -38,7 +38,9 @@ def cache_folder() -> Path:
         except OSError:
             continue
         return folder
-    raise MachineError("Neither ~/.cache nor the temporary folder can be written; set XDG_CACHE_HOME to one that can.")
+    raise MachineError(
+        "Neither ~/.cache nor the temporary folder can be written; set XDG_CACHE_HOME to a folder that can."
+    )
 
 
 def made_once(name: str, build: Callable[[Path], None]) -> Path:

@@ -26,11 +26,11 @@ from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
-from lerobot_constructskill.study.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
+from lerobot_constructskill.training.trainers import trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 

@@ -134,7 +134,7 @@ def _read(path: Path, kind: type[EpisodeRow]) -> pa.Table:
     except pa.ArrowInvalid as error:
         raise InputError(f"'{path}' cannot be read: {error}") from None
     if not table.schema.equals(_schema(kind)):
-        raise InputError(f"'{path}' is not a table of study rows of this version.")
+        raise InputError(f"'{path}' is not a table of a study's rows in this version's form.")
     return table
 
 

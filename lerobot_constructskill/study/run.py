@@ -66,7 +66,7 @@ def choose(runs: Sequence[Run], only: str) -> list[Run]:
     either = [pattern for one in only.split(",") for pattern in (one.strip(), f"{one.strip()}/*")]
     chosen = [run for run in runs if not only or any(fnmatchcase(run.id, pattern) for pattern in either)]
     if not chosen:
-        raise InputError(f"--only={only} fits no run; the first of the study is {runs[0].id}.")
+        raise InputError(f"--only={only} matches no run; the study's first run is {runs[0].id}.")
     return chosen
 
 

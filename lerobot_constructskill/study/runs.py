@@ -21,10 +21,11 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
-from lerobot_constructskill.study.checkpoints import LEARNING, checkpoint_artifact, decode_policy, settle_policy
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
-from lerobot_constructskill.study.spec import Study, Training, Variant
-from lerobot_constructskill.study.trainers import packages_of
+from lerobot_constructskill.study.spec import Study, Variant
+from lerobot_constructskill.training.checkpoints import LEARNING, checkpoint_artifact, decode_policy, settle_policy
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import packages_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
@@ -165,7 +166,7 @@ def _read_dagger(variant: Variant) -> Demonstrations:
 
 def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     if name not in REFERENCES:
-        raise InputError(f"Unknown reference '{name}'; there are: {', '.join(REFERENCES)}.")
+        raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
     reference = REFERENCES[name]
     arm = Arm(name=name, role=REFERENCE if reference.looks else SIGHTLESS, demonstrations=None, **common)
     if reference.policy:

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
-from lerobot_constructskill.bounds import Among, BatchSize, Count, Pattern, Range, Seed, Workers, check, check_values
-from lerobot_constructskill.contract import HELD_OUT_EVERY
+from lerobot_constructskill.bounds import Among, Count, Pattern, Seed, Workers, check, check_values
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.training.recipe import Training
 
 NAME = r"[a-z0-9][a-z0-9_-]*"
 """What studies, settings and variants are called: they name folders and videos, and stand in every row."""
@@ -33,12 +33,12 @@ class Variant:
     Args:
         policy: fields of a LeRobot policy, `type` among them.
         seeds: how many training seeds, `first_seed` and those that follow it.
-        data: other demonstrations than the setting's, for an ablation of the data.
+        data: demonstrations to use instead of the setting's, for an ablation of the data.
         dagger: what `constructskill-dagger` takes, a name or file: each seed is trained on rounds that it drives
-            itself. Its demonstrations and rounds count; policy, training and seed are the variant's.
+            itself. Only its demonstrations and rounds are used; policy, training and seed are the variant's.
         settings: names of the settings it runs in; all of them by default.
         training: fields of `Training` that differ from the study's.
-        first_seed: seeds that something is chosen on are not those that are reported (0 and up).
+        first_seed: the first training seed; results are reported on seeds from 0 on, choices are made on others.
     """
 
     policy: dict[str, Any]
@@ -55,29 +55,8 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Training:
-    """How every variant is trained (spec, section 4). Learning rate and weight decay are the policy's.
-
-    Args:
-        epochs: passes over the demonstrations that are not held out.
-        batch_size: frames per step.
-        holdout: one demonstration of so many is held out.
-
-    Raises:
-        ValueError: a number that nothing can be trained with.
-    """
-
-    epochs: Count = 150
-    batch_size: BatchSize = 256
-    holdout: Annotated[int, Range(2, 1_000_000)] = HELD_OUT_EVERY
-
-    def __post_init__(self):
-        check(self, "training.")
-
-
-@dataclass(frozen=True)
 class Study:
-    """Runs that are to be compared: every variant in every setting with every seed, and references beside them.
+    """Runs to compare: every variant in every setting with every seed, and references.
 
     Args:
         name: what the study is called.
@@ -89,7 +68,7 @@ class Study:
         eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
 
     Raises:
-        ValueError: a name or count that no study can be run with.
+        ValueError: a name or a number that cannot be used.
     """
 
     name: Annotated[str, Pattern(NAME, "a name of a-z, 0-9, '_' and '-'")]
@@ -104,13 +83,15 @@ class Study:
         check(self)
         for name in (*self.settings, *self.variants):
             if not re.fullmatch(NAME, name):
-                raise InputError(f"'{name}' is no name for a setting or variant; use a-z, 0-9, '_' and '-'.")
+                raise InputError(f"'{name}' cannot name a setting or variant; use a-z, 0-9, '_' and '-'.")
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
                 raise InputError(f"A study needs at least one of {kind}.")
         names = [*self.settings, *self.variants, *self.references]
         if twice := [name for name in names if names.count(name) > 1]:
-            raise InputError(f"'{twice[0]}' is the name of two things; settings, variants and references differ.")
+            raise InputError(
+                f"'{twice[0]}' is the name of two things; settings, variants and references need different names."
+            )
         for name, seeds in self.references.items():
             check_values(Variant, {"seeds": seeds}, f"references.{name}: ")
         for name, variant in self.variants.items():
@@ -118,9 +99,11 @@ class Study:
             unknown = [setting for setting in variant.settings or [] if setting not in self.settings]
             if unknown:
                 known = ", ".join(self.settings)
-                raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; there are: {known}.")
+                raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; the settings are: {known}.")
             if variant.dagger and variant.data:
-                raise InputError(f"Variant '{name}' has data, and dagger, which brings its own; name one of them.")
+                raise InputError(
+                    f"Variant '{name}' has both data and dagger, which brings its own data; give only one."
+                )
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
 
@@ -143,13 +126,13 @@ class Options:
     """How a study is run.
 
     Args:
-        only: make only runs setting/variant/seed_N that fit this, such as `fixed` or `fixed/*/seed_[0-4]`; commas
-            between several. (YAML reads a pattern that starts with `*` as something else, unless it is quoted twice.)
+        only: make only the runs setting/variant/seed_N that match, such as `fixed` or `fixed/*/seed_[0-4]`; several
+            separated by commas. (In YAML a pattern that starts with `*` must be quoted twice.)
         together: seeds that are trained and evaluated in one pass.
         executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
             store on a file system that all its machines share).
         workers: processes that generate demonstrations; jobs at a time on a Ray of this machine.
-        retry_failed: make again what failed before.
+        retry_failed: make runs again that failed before.
 
     Raises:
         ValueError: a count below 1 or an unknown executor.

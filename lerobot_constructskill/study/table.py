@@ -11,11 +11,11 @@ from typing import Any
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import LOG, Store
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.checkpoints import read_facts
 from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.validate import read_error
+from lerobot_constructskill.training.checkpoints import read_facts
 
 VIDEOS = "videos"
 
@@ -51,7 +51,7 @@ class Table:
         if name not in self._made and self.store.has(run.artifact):
             file = self.store.folder(run.artifact) / EPISODES
             if not file.is_file():
-                raise InputError(f"{file.parent} has no episodes, as no run of ours is left: move it away.")
+                raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
         return self._made.get(name)
 

@@ -10,7 +10,7 @@ from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
-from lerobot_constructskill.study.trainers import trainer_of
+from lerobot_constructskill.training.trainers import trainer_of
 
 FILE = "heldout.json"
 

@@ -200,11 +200,11 @@ def test_declared_comparisons_are_the_family(tmp_path):
 @pytest.mark.parametrize(
     ("analysis", "said"),
     [
-        ({"comparisons": [["one", "b"]]}, "Unknown variant in comparisons 'b'; there are: one, two."),
-        ({"order": ["b"]}, "Unknown variant in order 'b'; there are: one, two."),
-        ({"labels": {"b": "B"}}, "Unknown name in labels 'b'; there are: one, two, fixed."),
-        ({"comparisons": [["one"]]}, "A comparison is a pair of variants"),
-        ({"comparisons": [["one", "one"]]}, "A comparison is a pair of variants"),
+        ({"comparisons": [["one", "b"]]}, "Unknown variant in comparisons 'b'; the study has: one, two."),
+        ({"order": ["b"]}, "Unknown variant in order 'b'; the study has: one, two."),
+        ({"labels": {"b": "B"}}, "Unknown name in labels 'b'; the study has: one, two, fixed."),
+        ({"comparisons": [["one"]]}, "A comparison must be a pair of variants"),
+        ({"comparisons": [["one", "one"]]}, "A comparison must be a pair of variants"),
         ({"alpha": 1.0}, "analysis.alpha must be a finite number above 0 and at most 0.5, not 1.0"),
         ({"alpha": float("nan")}, "analysis.alpha must be a finite number above 0 and at most 0.5, not nan"),
         ({"alhpa": 0.1}, "alhpa"),
@@ -268,10 +268,10 @@ def test_a_study_without_any_run_gets_a_report(tmp_path):
 
 def test_what_cannot_be_reported_is_refused_in_a_sentence(tmp_path):
     rows = episode_rows(SMALL, ("fixed", "one", 0), 1, 1)
-    with pytest.raises(InputError, match="stands in the rows twice"):
+    with pytest.raises(InputError, match="is in the rows twice"):
         report(ReportConfig(write_study(tmp_path / "twice", SMALL, rows + rows[:1])))
     longer = episode_rows(SMALL | {"episodes": 5}, ("fixed", "one", 1), 1, 1)
-    with pytest.raises(InputError, match="Runs of 2 and of 5 episodes"):
+    with pytest.raises(InputError, match="runs of 2 and of 5 episodes"):
         report(ReportConfig(write_study(tmp_path / "mixed", SMALL, rows + longer)))
     with pytest.raises(InputError, match="has no rows"):
         report(ReportConfig(write_study(tmp_path / "empty", SMALL, [])))
@@ -287,7 +287,7 @@ def test_a_folder_that_is_no_studys_is_refused_in_a_sentence(name, tmp_path):
         with pytest.raises(InputError, match=f"{name}' (is not a study's file|cannot be read): "):
             report(ReportConfig(root))
     (root / name).unlink()
-    with pytest.raises(MissingError, match=f"'{root}' is no folder of a study: {name} is missing."):
+    with pytest.raises(MissingError, match=f"'{root}' is not the folder of a study: {name} is missing."):
         report(ReportConfig(root))
 
 

@@ -113,12 +113,12 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
         path.write_text(json.dumps(said))
         assert read_entries(root)[0].level == level
     path.write_text('{"level": "best"}')
-    with pytest.raises(InputError, match="no verdict"):
+    with pytest.raises(InputError, match="not a verdict"):
         read_entries(root)
     (root / "entries" / "No Name").mkdir()
     with pytest.raises(InputError, match="called by a name"):
         read_entries(root)
-    with pytest.raises(MissingError, match="no board"):
+    with pytest.raises(MissingError, match="is not a board"):
         read_entries(tmp_path / "nothing")
 
 

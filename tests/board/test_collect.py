@@ -57,7 +57,7 @@ def test_a_missing_episode_is_refused_unless_its_run_failed(recorded, tmp_path):
 
 def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
     recording(7, 0.05).write(recorded / "seed_3")
-    with pytest.raises(InputError, match="start 7 was recorded with different actions"):
+    with pytest.raises(InputError, match="start 7 was recorded twice, with different actions"):
         made(tmp_path / "made", recorded_in(recorded))
     with pytest.raises(InputError, match="several backends"):
         piles = {0: [recording(7), recording(8, backend="physx_cuda, gpu rendering")]}

@@ -63,4 +63,4 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()
     content[len(content) // 2] ^= 1
     (entry / EPISODES).write_bytes(content.tobytes())
-    assert "their hashes differ." in call("constructskill-verify", f"--root={entry}", fails=True)
+    assert "its hash differs." in call("constructskill-verify", f"--root={entry}", fails=True)

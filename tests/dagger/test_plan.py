@@ -11,7 +11,8 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.presets import find, names
 from lerobot_constructskill.study.runs import list_runs
-from lerobot_constructskill.study.spec import Setting, Study, Training, Variant
+from lerobot_constructskill.study.spec import Setting, Study, Variant
+from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
 CONFIG = DaggerConfig("local/set", ACT, base="smoke", rounds=3)

@@ -63,7 +63,7 @@ def test_lerobot_opens_no_damaged_file(damaged, pattern: str, way: str) -> None:
 
 def test_a_set_that_lerobot_has_edited_is_told_what_it_lacks(copy: Path) -> None:
     (copy / SIDECAR).unlink()
-    with pytest.raises(MissingError, match="lerobot-edit-dataset drops it"):
+    with pytest.raises(MissingError, match="lerobot-edit-dataset removes it"):
         check_dataset(CheckConfig(root=copy))
 
 

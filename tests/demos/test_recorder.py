@@ -28,7 +28,7 @@ NEVER = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Three noisy demonstrations with the wrist view, and their frames as a table."""
+    """Three noisy demonstrations with the wrist camera, and their frames as a table."""
     root = tmp_path_factory.mktemp("data") / "set"
     summary = record(GenerateConfig("local/set", str(root), episodes=3, obs_type="pixels_agent_pos"))
     dataset = LeRobotDataset("local/set", root=root)
@@ -177,7 +177,7 @@ def test_a_killed_run_of_two_workers_continues_to_the_bytes_of_an_undisturbed_on
 def test_the_replay_command_says_how_many_ended_as_recorded(recorded):
     command = [sys.executable, "-m", "lerobot_constructskill.scripts.replay", f"--root={recorded[1].root}"]
     done = subprocess.run([*command, "--episodes=[2]"], capture_output=True, text=True)
-    assert done.returncode == 0 and "1 demonstrations ended as recorded" in done.stdout, done.stderr
+    assert done.returncode == 0 and "1 demonstration ended as recorded" in done.stdout, done.stderr
     assert done.stdout.startswith("PREGRASP")
 
 

@@ -31,7 +31,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"crop": [0.1, 0.9]}, r"got \[0.1, 0.9\]"),
         ({"head_hidden_dim": 0}, "from 1 to .*, not 0"),
         ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention"),
-        ({"readout": "mean", "standardize_features": True}, "readout=cls alone, got readout=mean"),
+        ({"readout": "mean", "standardize_features": True}, "readout=cls only, not mean"),
         ({"regression_weight": 0}, "above 0 .* not 0"),
         ({"scheduler_warmup_steps": -1}, "from 0 to .* not -1"),
         ({"regression_weight": math.nan}, "regression_weight must be a finite number above 0 .* not nan"),

@@ -137,7 +137,7 @@ def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
     with pytest.raises(FileNotFoundError, match="matches no checkpoint"):
         evaluate_offline(OfflineConfig([str(tmp_path / "none")], "local/random", feature_set.root))
     (tmp_path / "config.json").touch()
-    with pytest.raises(ValueError, match="among the 8 there are"):
+    with pytest.raises(ValueError, match="must be among 0 to 7"):
         evaluate_offline(OfflineConfig([str(tmp_path)], "local/random", feature_set.root, episodes=[8]))
 
 

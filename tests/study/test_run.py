@@ -37,7 +37,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_constructskill.rollout.references import REFERENCES, ExpertAgent, Reference
-from lerobot_constructskill.study.trainers import Trainer
+from lerobot_constructskill.training.trainers import Trainer
 
 
 @PreTrainedConfig.register_subclass("late_act")

@@ -14,8 +14,9 @@ from lerobot_constructskill.study.execute import EPISODES
 from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import list_runs
-from lerobot_constructskill.study.spec import Options, Setting, Study, Training, Variant
+from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
+from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
 """A policy that needs no weights from anywhere."""
@@ -188,7 +189,7 @@ def test_some_runs_are_chosen_by_their_names():
     ]
     assert len(choose(runs, "")) == len(choose(runs, "fixed")) == len(runs)
     assert len(choose(list_runs(study(variants={"a": Variant(ACT, 12)})), "fixed/a/seed_1")) == 1
-    with pytest.raises(InputError, match="fits no run"):
+    with pytest.raises(InputError, match="matches no run"):
         choose(runs, "other/*")
 
 
@@ -210,7 +211,7 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
     "fields, said",
     [
         ({"variants": {}}, "at least one of variants"),
-        ({"variants": {"a b": Variant(ACT)}}, "'a b' is no name"),
+        ({"variants": {"a b": Variant(ACT)}}, "'a b' cannot name"),
         ({"variants": {"no_op": Variant(ACT)}}, "name of two things"),
         ({"variants": {"a": Variant({})}}, "must name its policy's type"),
         ({"variants": {"a": Variant({"type": "pi9"})}}, "variants.a.policy: .*pi9"),
@@ -227,7 +228,7 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ),
         ({"variants": {"a": Variant(ACT, settings=["moved"])}}, "Unknown setting 'moved' of variant 'a'"),
         ({"variants": {"a": Variant(ACT, data="fasst")}}, "no file and no generate configuration 'fasst'"),
-        ({"references": {"oracle": 1}}, "Unknown reference 'oracle'; there are: no_op"),
+        ({"references": {"oracle": 1}}, "Unknown reference 'oracle'; the references are: no_op"),
         ({"references": {"random": 0}}, "references.random: seeds must be a whole number from 1"),
         ({"episodes": 0}, "episodes must be a whole number from 1"),
         ({"eval_seed": -1}, "eval_seed must be a whole number from 0"),

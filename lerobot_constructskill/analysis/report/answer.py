@@ -1,8 +1,9 @@
 """What a study says, in sentences made from its findings: the paragraph at the top of a report."""
 
 from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
-from lerobot_constructskill.analysis.report.wording import episodes, listed, plural, seeds, share_range, tau
+from lerobot_constructskill.analysis.report.wording import episodes, listed, quoted, seeds, share_range, tau
 from lerobot_constructskill.analysis.stats.comparisons import Comparison, Verdict
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.rows import SIGHTLESS
 
 SOLVED = 0.9
@@ -69,7 +70,7 @@ def _best(lines: list[Line], n_episodes: int) -> str:
     each = " each" if len(best) > 1 else ""
     rank = f", the most of {len(rivals)} variants with {seeds(most_seeds)}" if len(rivals) > len(best) else ""
     return (
-        f"{listed([line.label for line in best])} placed the object in {placed.counts.met} of "
+        f"{listed([quoted(line.label) for line in best])} placed the object in {placed.counts.met} of "
         f"{seeds(placed.counts.seeds)}{each} (95 % interval {share_range(placed.exact)}), "
         f"in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
     )
@@ -78,7 +79,7 @@ def _best(lines: list[Line], n_episodes: int) -> str:
 def _lifts(lines: list[Line]) -> str:
     best = max(lines, key=lambda line: line.outcomes["lifted"].mean.value)
     counts = best.outcomes["lifted"].counts
-    return f"the most that any lifted it is {counts.met} of {seeds(counts.seeds)}, by {best.label}"
+    return f"at best it was lifted in {counts.met} of {seeds(counts.seeds)}, by {quoted(best.label)}"
 
 
 def _verdicts(setting: SettingFindings, criterion: str, noun: str) -> str:
@@ -108,8 +109,8 @@ def _beats(pairs: list[tuple[str, str]], setting: SettingFindings) -> str:
     """ "a beats b and c; d beats c"."""
     losers: dict[str, list[str]] = {}
     for winner, loser in pairs:
-        losers.setdefault(winner, []).append(setting.labels[loser])
-    return "; ".join(f"{setting.labels[winner]} beats {listed(beaten)}" for winner, beaten in losers.items())
+        losers.setdefault(winner, []).append(quoted(setting.labels[loser]))
+    return "; ".join(f"{quoted(setting.labels[winner])} beats {listed(beaten)}" for winner, beaten in losers.items())
 
 
 def _shares(setting: SettingFindings, alpha: float) -> str:
@@ -118,7 +119,7 @@ def _shares(setting: SettingFindings, alpha: float) -> str:
     if setting.all_or_nothing or not setting.rate_tests["placed"]:
         return ""
     pairs = [(test.a, test.b) if test.mean > 0 else (test.b, test.a) for test in tests]
-    found = _beats(pairs, setting) if pairs else "no pair is told apart"
+    found = _beats(pairs, setting) if pairs else "no pair can be told apart"
     return f"Seeds succeed in some of their episodes here; by mean episodes placed, {found}."
 
 
@@ -127,7 +128,7 @@ def _offline_error(setting: SettingFindings, alpha: float) -> str:
     if correlation is None:
         return ""
     if correlation.p_value >= alpha:
-        return f"Held-out error does not tell which seeds of a variant place ({tau(correlation)})."
+        return f"Held-out error does not show which seeds of a variant place ({tau(correlation)})."
     direction = "lower" if correlation.tau.value < 0 else "higher"
     return f"A variant's seeds with {direction} held-out error place more often ({tau(correlation)})."
 
@@ -135,7 +136,9 @@ def _offline_error(setting: SettingFindings, alpha: float) -> str:
 def _sightless(setting: SettingFindings, n_episodes: int) -> str:
     sightless = [line for line in setting.references if line.role == SIGHTLESS and line.outcomes]
     placed = [(line.label, line.outcomes["placed"].mean.value) for line in sightless]
-    solving = [f"{label} places in {episodes(share, n_episodes)}" for label, share in placed if share >= SOLVED]
+    solving = [
+        f"{quoted(label)} places in {episodes(share, n_episodes)}" for label, share in placed if share >= SOLVED
+    ]
     if not solving:
         return ""
     return f"{listed(solving)} without looking at the scene, so success here does not show that a policy sees."

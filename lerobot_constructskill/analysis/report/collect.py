@@ -60,12 +60,12 @@ def check_rows(rows: pd.DataFrame) -> None:
     if bare := [name for name in rows["setting"].unique() if name not in with_variants]:
         raise InputError(f"Setting '{bare[0]}' has no variant to report.")
     if len(lengths := sorted(rows["episodes"].unique())) > 1:
-        raise InputError(f"Runs of {lengths[0]} and of {lengths[1]} episodes stand in one table; report them apart.")
+        raise InputError(f"One table has runs of {lengths[0]} and of {lengths[1]} episodes; report them separately.")
     twice = rows.duplicated([*RUN, "episode"])
     if twice.any():
         row = rows[twice].iloc[0]
         raise InputError(
-            f"Episode {row['episode']} of {row['setting']}/{row['variant']}/seed_{row['training_seed']} stands in the "
+            f"Episode {row['episode']} of {row['setting']}/{row['variant']}/seed_{row['training_seed']} is in the "
             "rows twice; every episode must be counted once."
         )
 

@@ -21,7 +21,7 @@ from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
 from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.power import seeds_needed, wrong_order
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, read_rows
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -32,7 +32,7 @@ MARKDOWN = "\\`*_[]|"
 WORDS = (
     *(wording.chance, wording.p_value, wording.percent, wording.rare, wording.share_range, wording.signed),
     *(wording.points, wording.points_range, wording.mean_episodes, wording.episodes_range, wording.error_range),
-    *(wording.plural, wording.seeds),
+    *(plural, wording.seeds),
 )
 """What templates may call as filters."""
 
@@ -84,7 +84,7 @@ def read_study(root: Path) -> tuple[Heading, pd.DataFrame]:
     """Read what a report takes of a study's file, and its rows. Raises as `write_report` does."""
     for name in (STUDY, ROWS):
         if not (root / name).is_file():
-            raise MissingError(f"'{root}' is no folder of a study: {name} is missing.")
+            raise MissingError(f"'{root}' is not the folder of a study: {name} is missing.")
     return _read_heading(root / STUDY), read_rows(root / ROWS)
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from lerobot_constructskill.analysis.stats.correlation import Correlation
 from lerobot_constructskill.analysis.stats.intervals import Estimate
+from lerobot_constructskill.errors import plural
 
 
 def percent(share: float) -> str:
@@ -82,8 +83,9 @@ def seeds(n: int) -> str:
     return plural(n, "seed")
 
 
-def plural(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+def quoted(label: str) -> str:
+    """A label as it stands in a sentence: in quotation marks where it has a comma of its own."""
+    return f"“{label}”" if "," in label else label
 
 
 def listed(items: Sequence[str]) -> str:

@@ -1,6 +1,6 @@
 """From episodes to seeds: what a training run achieved, and how many runs met a criterion.
 
-The seed is the sample. Episodes are counted within their run and never pooled over runs: with a fixed spawn the
+The seed is the sample. Episodes are counted within their run and never pooled over runs: at a fixed position the
 episodes of a run repeat one trajectory (paper, section III).
 """
 

@@ -257,5 +257,5 @@ def check_backbone(name: str) -> None:
     if name not in BACKBONES and not re.fullmatch(NAMED, name):
         raise InputError(
             f"Unknown backbone '{name}'; the backbones are: {', '.join(BACKBONES)}, any model of timm as timm/<model> "
-            "and any of transformers as hf/<owner>/<name>, both with @<commit> behind it where it is to be pinned."
+            "and any of transformers as hf/<owner>/<name>, both with @<commit> at the end to pin it."
         )

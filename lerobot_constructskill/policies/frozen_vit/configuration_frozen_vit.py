@@ -47,35 +47,35 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         chunk_size: future steps predicted at once.
         n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
         backbone: an entry of `backbones.BACKBONES`, or any model of timm as `timm/<model>` and of transformers as
-            `hf/<owner>/<name>`; `@<commit>` behind it pins what the Hub has.
+            `hf/<owner>/<name>`; `@<commit>` at the end pins a version on the Hub.
         backbone_path: folder or file with the weights; None looks at the Hub, then at installed packages that hold
-            them, and so does a checkpoint (or a feature set) that knows their hash where the path does not exist.
-        backbone_pretrained: False draws the weights of the same architecture at random: what is pretraining worth?
+            them. So does a checkpoint (or a feature set) that knows their hash, if the path does not exist.
+        backbone_pretrained: False draws the weights of the same architecture at random, to measure what it gives.
         backbone_source: written by the policy: where the weights came from.
         backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
             set, they must be those that made it) and checked whenever the checkpoint is loaded.
         backbone_precision: what the backbone computes in: "float32", "bfloat16", or "auto", which becomes that of the
-            feature set, or else the fastest that the device does natively.
-        backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. A
-            `backbone_precision` other than this one is a crossing, which is logged with the drift of the features.
-        save_backbone: whether checkpoints hold the backbone; without it they are small and need a source.
+            feature set, or without one the fastest that the device has natively.
+        backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. If
+            `backbone_precision` is another one, the log says so, with the drift of the features.
+        save_backbone: whether checkpoints hold the backbone; without it they are small and need a source of weights.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
-            height (0 to 1); None takes it all, as the paper does. On a feature set, the one it was encoded with.
-        blind: whether the encoder sees a grey image, whatever there is to see: what is seeing worth?
+            height (0 to 1); None takes all of it, as the paper does. On a feature set it must be that of its encoding.
+        blind: whether the encoder always sees a grey image, to measure what seeing gives.
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
             ("spatial_softmax"), or what a few learned queries find ("attention"). On a feature set all but the
             first need its patch features.
-        standardize_features: whether the heads see each feature with the data set's mean and deviation taken
-            out. The linear heads can express the same functions either way (the paper's is False), but Adam gets
-            there in far fewer samples. Needs a feature set, whose statistics go into the checkpoint; they are
-            those that LeRobot computes, of the whole data set, episodes held out for evaluation included. For
-            the readout "cls" alone.
+        standardize_features: whether each feature is standardised by the data set's mean and deviation. The linear
+            heads can express the same functions either way (the paper's is False), but Adam needs far fewer
+            samples. Needs a feature set, whose statistics go into the checkpoint; they are
+            those that LeRobot computes, of the whole data set, episodes held out for evaluation included. Only
+            for the readout "cls".
         use_state: whether the heads also see the normalised `observation.state`.
         head_hidden_dim: width of a hidden layer (GELU) in each of the two heads; None makes them linear, as the
             paper does.
-        fps: actions a second. A data set of another rate is refused.
+        fps: actions per second. A data set of another rate is refused.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
         action_scale: bound of the regression head, `action_scale * tanh(.)`, in metres (and radians).
@@ -83,16 +83,16 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         gripper_threshold: the bce head opens above this logit (0.5, as the paper says, is p = 0.62). The
             regression head opens above 0, the middle of its two labels.
         temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
-            exp(-coeff * i). -0.1 is the paper's exp(-0.1 k) with k the steps since a chunk was predicted: the
-            newest weighs most. None takes the newest chunk's first action.
-        regression_weight: weight of the translations' squared error, some 1e-4 m2, beside the gripper's loss. Heads
-            that share no parameters need none; a readout that learns serves both.
+            exp(-coeff * i). -0.1 is the paper's exp(-0.1 k), where k is the steps since a chunk was predicted: the
+            newest has most weight. None takes the newest chunk's first action.
+        regression_weight: weight of the translations' squared error (about 1e-4 m2) relative to the gripper's loss. It
+            matters only with a readout that learns, because both heads then share its parameters.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
             None keeps it constant, as the paper does.
     """
 
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
-    """What trains it in a study, `study.trainers.Trainer`: many seeds at once, on features that are encoded once."""
+    """What trains it in a study, a `training.trainers.Trainer`: many seeds at once, on features encoded once."""
 
     device: DeviceName | None = None
     n_obs_steps: Annotated[int, Range(1, 1)] = 1
@@ -147,8 +147,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         check_crop(self.crop)
         if self.standardize_features and self.readout != "cls":
             raise InputError(
-                f"standardize_features serves readout=cls alone, got readout={self.readout}: the statistics of a "
-                "feature set are those of its pooled feature."
+                f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
+                "set are those of its pooled feature."
             )
         _check_action_names(self.action_names)
         if self.n_action_steps > self.chunk_size:
@@ -158,7 +158,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if abs(self.temporal_ensemble_coeff or 0) * self.chunk_size > LARGEST_EXPONENT:
             raise InputError(
                 f"temporal_ensemble_coeff must be within {LARGEST_EXPONENT / self.chunk_size:g} of 0 with "
-                f"chunk_size={self.chunk_size}, or weights overflow, not {self.temporal_ensemble_coeff}."
+                f"chunk_size={self.chunk_size}, not {self.temporal_ensemble_coeff}: weights would overflow."
             )
         if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
             raise InputError(
@@ -271,6 +271,6 @@ def _check_action_names(names: Any) -> None:
     )
     if not served:
         raise InputError(
-            f"frozen_vit acts in one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}'; "
-            f"got action names {names}."
+            f"action_names must be one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}', "
+            f"not {names}."
         )

@@ -46,7 +46,7 @@ class SharedEyes:
 class _Memory:
     """One encoder, and what it made of the frames that it has seen.
 
-    With a fixed spawn a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
+    At a fixed position a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
 
     Args:
         policy: one of the policies that see with it.

@@ -45,7 +45,7 @@ def _from_timm(name: str, model: str, revision: str) -> Backbone:
 
     facts = timm.get_pretrained_cfg(model) if timm.is_model(model) else None
     if facts is None:
-        raise InputError(f"timm has no model '{model}'; `timm.list_models()` lists those it has.")
+        raise InputError(f"timm has no model '{model}'; `timm.list_models()` lists its models.")
     build = partial(_build_timm, model)
     return Backbone(
         name=name,
@@ -112,7 +112,7 @@ def _folder_with(file: str, repo_id: str, revision: str, path: str | None) -> Pa
         found = hub_file(repo_id, revision, (file,))
     if found is None or not found.is_file():
         raise MissingWeightsError(
-            f"'{path or repo_id}' has no {file}, which tells what the model is: give a folder that has "
+            f"'{path or repo_id}' has no {file}, which says what the model is: give a folder that has "
             f"with --policy.backbone_path=<folder>, or let this machine reach the Hub (hf download {repo_id})."
         )
     return found.parent
@@ -150,7 +150,7 @@ def _layout(name: str, model: nn.Module, encode: Encode) -> dict[str, Any]:
         raise InputError(f"{name} does not encode one image of {IMAGE_SIZE} x {IMAGE_SIZE} ({said}).") from None
     if pooled.shape[1:] != patches.shape[2:]:
         raise InputError(
-            f"{name} pools {pooled.shape[-1]} numbers of patches of {patches.shape[-1]}; they have to be alike."
+            f"{name} pools {pooled.shape[-1]} numbers of patches of {patches.shape[-1]}; these must be equal."
         )
     return {"feature_dim": pooled.shape[-1], "n_patches": patches.shape[1], "readout": "pooled_by_its_configuration"}
 

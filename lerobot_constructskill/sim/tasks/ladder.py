@@ -14,7 +14,7 @@ class BrickLadderEnv(PreciseEnv, BrickToBinEnv):
     """
     **Task Description:**
     Put the paper's brick into a bin that leaves it a total clearance of 40, 20, 10, 5 or 3 mm in both x and y. The bin
-    is shallow, so that the fingers that let the brick go on its floor open above the rim.
+    is shallow: when the brick is on its floor, the fingers that release it open above the rim.
 
     **Randomizations:**
     - The brick's centre is uniform within 0.10 m of its nominal place in x and y; its yaw is fixed.

@@ -13,8 +13,8 @@ from lerobot.utils import auto_select_torch_device
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.parsing import decode
-from lerobot_constructskill.study.spec import Training
-from lerobot_constructskill.study.trainers import packages_of, policy_spec, trainer_of
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import packages_of, policy_spec, trainer_of
 
 LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
 """Packages whose versions may show in any checkpoint."""

@@ -1,0 +1,1 @@
+"""How a policy is trained and its checkpoint kept: recipe, trainers, checkpoints in a store."""

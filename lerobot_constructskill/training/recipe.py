@@ -1,0 +1,28 @@
+"""How long and on what part of the demonstrations a policy is trained."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from lerobot_constructskill.bounds import BatchSize, Count, Range, check
+from lerobot_constructskill.contract import HELD_OUT_EVERY
+
+
+@dataclass(frozen=True)
+class Training:
+    """How a policy is trained on demonstrations. Learning rate and weight decay are the policy's.
+
+    Args:
+        epochs: passes over the demonstrations that are not held out.
+        batch_size: frames per step.
+        holdout: every holdout-th demonstration is held out.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    epochs: Count = 150
+    batch_size: BatchSize = 256
+    holdout: Annotated[int, Range(2, 1_000_000)] = HELD_OUT_EVERY
+
+    def __post_init__(self):
+        check(self, "training.")
