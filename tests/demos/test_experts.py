@@ -68,7 +68,7 @@ def test_the_expert_stays_above_an_object_it_is_not_over():
 def test_what_little_play_is_left_narrows_as_the_object_comes_down():
     """The expert lowers inside a funnel: far off the middle high above the opening, hardly at all at its rim."""
     expert = make_expert(TASKS["brick_to_bin_10mm"], ExpertConfig())
-    middle = dict(bin_position=[0.0, -0.35, 0.025], bin_interior=[0.22, 0.075, 0.04])
+    middle = {"bin_position": [0.0, -0.35, 0.025], "bin_interior": [0.22, 0.075, 0.04]}
 
     def lowered(off: float, gap: float) -> bool:
         held = [off, -0.35, 0.045 + gap + 0.05]

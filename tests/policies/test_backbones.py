@@ -217,7 +217,7 @@ def test_fine_maps_are_the_stages_that_timm_names_by_their_reduction(images):
 
     fine = BACKBONES["efficientnet_lite0_fine"]
     model = fine.build().eval()
-    stages = timm.create_model("tf_efficientnet_lite0", pretrained=False, features_only=True, out_indices=(2, 3)).eval()
+    stages = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
     stages.load_state_dict({name: model.state_dict()[name] for name in stages.state_dict()})
     with torch.no_grad():
         at_8, at_16 = stages(images)
