@@ -40,8 +40,8 @@ FINEST, COARSEST = 0.0008, 0.005
 """Bounds on the error in metres that RELEASE accepts before it lowers; in between, half the play."""
 
 FUNNEL = 0.15
-"""Metres off the middle that RELEASE accepts in addition for each metre left to the rim. An arm that aligns as it comes
-down is in the middle before it arrives; one that waits above until it is aligned teaches a policy to wait."""
+"""Metres off the middle that RELEASE accepts in addition, for each metre left to the rim. An arm that aligns while it
+comes down is in the middle before it arrives; one that waits above until it is aligned teaches a policy to wait."""
 
 YAW_STEP, YAW_TOLERANCE = 0.1, 0.03
 """Largest rotation asked for in a step, and the error at which a phase may end, in radians."""
