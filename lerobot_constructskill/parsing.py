@@ -1,5 +1,7 @@
 """Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
 
+import json
+import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -7,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import yaml
 
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.lerobot_internals import ArgumentParser
@@ -22,12 +25,25 @@ def parse[Config](
 ) -> Config:
     """Read a configuration from flags, the command line's by default, and a YAML file that they are put over.
 
+    A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias.
+
     Raises:
         InputError: they do not make a configuration.
         OSError: the file cannot be opened.
     """
+    flags = [_readable(flag) for flag in (sys.argv[1:] if flags is None else flags)]
     with as_input():
         return ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
+
+
+def _readable(flag: str) -> str:
+    """A flag whose value YAML can read: in quotation marks where it cannot."""
+    name, _, value = flag.partition("=")
+    try:
+        yaml.compose(value, Loader=yaml.SafeLoader)
+    except yaml.YAMLError:
+        return f"{name}={json.dumps(value)}"
+    return flag
 
 
 def decode[Config](config_class: type[Config], fields: Mapping[str, Any]) -> Config:

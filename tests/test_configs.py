@@ -17,6 +17,7 @@ from lerobot_constructskill import presets
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
+from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.runs import list_runs
@@ -170,3 +171,10 @@ def test_other_policies_accept_our_features_under_the_names_they_know(kind, trai
     assert policy.type == kind and not policy.push_to_hub
     seconds = policy.n_action_steps / FPS
     assert 0.3 <= seconds <= 0.5 and max(policy.action_delta_indices) < 60
+
+
+@pytest.mark.parametrize("pattern", ["*/seed_0", "[!p]*/dinov2*", "fixed/*/seed_[0-4]", "a: b: c", '"quoted"*'])
+def test_a_pattern_is_taken_as_it_was_typed(pattern):
+    """YAML would take the first for an alias and the second for a list, and refuse both."""
+    flags = [f"--config_path={CONFIGS / 'study' / 'smoke.yaml'}", f"--only={pattern}"]
+    assert parse(StudyConfig, flags).only == pattern

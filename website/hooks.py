@@ -14,6 +14,7 @@ import task_pages
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 ASSETS = Path(__file__).parent / "assets"
@@ -54,6 +55,13 @@ def on_page_markdown(markdown: str, page: Page, **_) -> str:
 
     markdown = LINK.sub(lead, markdown)
     return task_pages.with_links(markdown) if page.file.src_uri == "docs/tasks.md" else markdown
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Store the plots of the reports with 256 colours: they have fewer, and take a third of the room."""
+    for figure in Path(config.site_dir).glob("results/*/figures/*.png"):
+        with Image.open(figure) as image:
+            image.convert("RGB").quantize().save(figure, optimize=True)
 
 
 def reached(pages: list[Path]) -> list[Path]:

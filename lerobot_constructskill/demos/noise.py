@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lerobot_constructskill.bounds import Among, Range, check
+from lerobot_constructskill.contract import GRIPPER_CLOSED
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
@@ -29,6 +30,9 @@ class NoiseConfig:
         fitted_on: what the covariance was fitted on, for the data set's provenance.
         clip: bound on each axis of the executed translation, in metres, with and without noise.
         phases: names of the phases that are perturbed. GRASP and RELEASE have no noise, to keep contacts clean.
+        release_sigma: standard deviation per axis, in metres, of the noise in RELEASE for as long as the jaws are
+            closed; the paper has none there. Where a task leaves little play, demonstrations without it never show
+            how an object beside its place is brought back.
 
     Raises:
         ValueError: unknown model or phase, sigma or clip out of range, or a covariance that is missing or wrong.
@@ -40,6 +44,7 @@ class NoiseConfig:
     fitted_on: dict[str, str] | None = None
     clip: Clip = 0.08
     phases: list[PhaseName] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
+    release_sigma: Sigma = 0.0
 
     def __post_init__(self):
         check(self, "noise.")
@@ -78,7 +83,10 @@ def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.rando
     Returns:
         (n,) float32; the translation perturbed and clipped, every other channel unchanged.
     """
-    noise = config.root @ rng.standard_normal(3) * (phase in config.phases)
+    drawn = rng.standard_normal(3)
+    noise = config.root @ drawn * (phase in config.phases)
+    if config.release_sigma and phase == Phase.RELEASE and action[-1] == GRIPPER_CLOSED:
+        noise = config.release_sigma * drawn
     executed = action.copy()
     executed[:3] = np.clip(action[:3] + noise, -config.clip, config.clip)
     return executed

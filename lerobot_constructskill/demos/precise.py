@@ -39,6 +39,10 @@ LOWERING_STEP = 0.008
 FINEST, COARSEST = 0.0008, 0.005
 """Bounds on the error in metres that RELEASE accepts before it lowers; in between, half the play."""
 
+FUNNEL = 0.15
+"""Metres off the middle that RELEASE accepts in addition, for each metre left to the rim. An arm that aligns while it
+comes down is in the middle before it arrives; one that waits above until it is aligned teaches a policy to wait."""
+
 YAW_STEP, YAW_TOLERANCE = 0.1, 0.03
 """Largest rotation asked for in a step, and the error at which a phase may end, in radians."""
 
@@ -91,11 +95,12 @@ class PreciseExpert(PickPlaceExpert):
         return np.array([*step + self._weight_compensation(state) + _outward(state), GRIPPER_CLOSED])
 
     def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
-        """How fast to lower, 0 to 1: not at all until the object is over the opening, and gradually from there."""
-        if _underside(state) < _rim(state):
+        """How fast to lower, 0 to 1: not at all outside a funnel over the opening, and gradually from its wall on."""
+        gap = _underside(state) - _rim(state)
+        if gap < 0:
             return 1.0
         play = (state.bin_interior - state.object_size)[:2] / 2
-        accepted = np.clip(play / 2, FINEST, COARSEST)
+        accepted = np.clip(play / 2, FINEST, COARSEST) + FUNNEL * gap
         return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
 
     # Advice

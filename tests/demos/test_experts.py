@@ -65,6 +65,21 @@ def test_the_expert_stays_above_an_object_it_is_not_over():
     assert expert.act(beside, progress)[0][2] > 0 and expert.act(beside, progress)[0][1] < 0
 
 
+def test_what_little_play_is_left_narrows_as_the_object_comes_down():
+    """The expert lowers inside a funnel: far off the middle high above the opening, hardly at all at its rim."""
+    expert = make_expert(TASKS["brick_to_bin_10mm"], ExpertConfig())
+    middle = {"bin_position": [0.0, -0.35, 0.025], "bin_interior": [0.22, 0.075, 0.04]}
+
+    def lowered(off: float, gap: float) -> bool:
+        held = [off, -0.35, 0.045 + gap + 0.05]
+        at = state(object_pose=[*held, 1, 0, 0, 0], tcp_pose=[*held, 0, 1, 0, 0], fingers=[0.0325] * 2, **middle)
+        return expert._haste(at, expert._carry_error(at)) == 1.0
+
+    assert lowered(0.003, gap=0.04) and not lowered(0.003, gap=0.0) and lowered(0.001, gap=0.0)
+    assert not lowered(0.02, gap=0.04)
+    assert lowered(0.003, gap=-0.001), "in the opening there is no way but down"
+
+
 @pytest.mark.parametrize("x, height", [(0.0, 0.40), (0.10, 0.25)])
 def test_the_lift_is_the_papers_or_as_high_as_the_arm_reaches(x, height):
     expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())

