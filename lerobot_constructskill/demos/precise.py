@@ -39,6 +39,10 @@ LOWERING_STEP = 0.008
 FINEST, COARSEST = 0.0008, 0.005
 """Bounds on the error in metres that RELEASE accepts before it lowers; in between, half the play."""
 
+INSERTED = 0.003
+"""Depth in metres below the rim from which on there is no way but down. Before it, an object that the rim has pushed
+aside rises and comes again."""
+
 FUNNEL = 0.15
 """Metres off the middle that RELEASE accepts in addition, for each metre left to the rim. An arm that aligns while it
 comes down is in the middle before it arrives; one that waits above until it is aligned teaches a policy to wait."""
@@ -97,10 +101,10 @@ class PreciseExpert(PickPlaceExpert):
     def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
         """How fast to lower, 0 to 1: not at all outside a funnel over the opening, and gradually from its wall on."""
         gap = _underside(state) - _rim(state)
-        if gap < 0:
+        if gap < -INSERTED:
             return 1.0
         play = (state.bin_interior - state.object_size)[:2] / 2
-        accepted = np.clip(play / 2, FINEST, COARSEST) + FUNNEL * gap
+        accepted = np.clip(play / 2, FINEST, COARSEST) + FUNNEL * max(gap, 0)
         return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
 
     # Advice
