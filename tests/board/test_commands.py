@@ -58,7 +58,8 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     said = call("constructskill-verify", f"--root={entry}", *rerun)
     assert "4 of 4 episodes replayed (12 steps)" in said and "shifted 0% submitted, 0% run anew" in said
     assert '"level": "re-run"' in (tmp_path / "verified" / "entry.json").read_text()
-    assert "the re-run has others" in call("constructskill-verify", f"--root={entry}", *rerun[1:], "--value=cafe", fails=True)
+    said = call("constructskill-verify", f"--root={entry}", *rerun[1:], "--value=cafe", fails=True)
+    assert "'cafe' calls for the starts from" in said and "the re-run has others" in said
 
     content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()
     content[len(content) // 2] ^= 1
