@@ -143,14 +143,16 @@ def _encode_maps(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     return patches.mean(dim=1), patches
 
 
+FINE_STAGES = [2, 3]
+"""Of a network in timm: the stages that shrink an image 8 and 16 times."""
+
+
 def _encode_fine_maps(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """The average, and the last maps of 28 x 28 and of 14 x 14 positions side by side, on the finer grid.
 
     In the last map of these networks a position is 32 pixels wide; here it is 8.
     """
-    maps = model.bn1(model.conv_stem(pixels))
-    stages = [maps := block(maps) for block in model.blocks[:5]]
-    fine, coarse = stages[2], stages[4]
+    fine, coarse = model.forward_intermediates(pixels, FINE_STAGES, stop_early=True, intermediates_only=True)
     coarse = F.interpolate(coarse, size=fine.shape[-2:], mode="bilinear", align_corners=False)
     patches = torch.cat([fine, coarse], dim=1).flatten(2).transpose(1, 2)
     return patches.mean(dim=1), patches
