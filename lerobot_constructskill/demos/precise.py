@@ -103,25 +103,22 @@ class PreciseExpert(PickPlaceExpert):
         gap = _underside(state) - _rim(state)
         if gap < -INSERTED:
             return 1.0
-        play = (state.bin_interior - state.object_size)[:2] / 2
-        accepted = np.clip(play / 2, FINEST, COARSEST) + FUNNEL * max(gap, 0)
+        accepted = np.clip(_play(state) / 2, FINEST, COARSEST) + FUNNEL * max(gap, 0)
         return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
 
     # Advice
 
     def _is_there(self, stance: Stance) -> bool:
         state = stance.state
-        play = (state.bin_interior - state.object_size)[:2] / 2
         floor = state.bin_position[2] - state.bin_interior[2] / 2
-        off = abs(self._carry_error(state)[:2])
-        return bool(stance.stands and (off < np.maximum(play, COARSEST)).all() and stance.underside < floor + SEATED)
+        is_over = _is_over_opening(state, self._carry_error(state))
+        return bool(stance.stands and is_over and stance.underside < floor + SEATED)
 
     def _is_at_receptacle(self, stance: Stance) -> bool:
         """RELEASE aligns above the opening; an object that has come down beside it rises again."""
         state, error = stance.state, self._carry_error(stance.state)
         if stance.underside < _rim(state):
-            play = (state.bin_interior - state.object_size)[:2] / 2
-            return bool((abs(error[:2]) < np.maximum(play, COARSEST)).all())
+            return _is_over_opening(state, error)
         return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
 
     def _release_error(self, stance: Stance) -> np.ndarray:
@@ -197,6 +194,15 @@ def _underside(state: PrivilegedState) -> float:
 
 def _top(state: PrivilegedState) -> float:
     return state.object_pose[2] + state.object_size[2] / 2
+
+
+def _play(state: PrivilegedState) -> np.ndarray:
+    """Room beside the object in x and y, (2,) metres; below 0 where it has a shoulder that stays outside."""
+    return (state.bin_interior - state.object_size)[:2] / 2
+
+
+def _is_over_opening(state: PrivilegedState, error: np.ndarray) -> bool:
+    return bool((abs(error[:2]) < np.maximum(_play(state), COARSEST)).all())
 
 
 def _rim(state: PrivilegedState) -> float:
