@@ -1,7 +1,6 @@
 """Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
 
 import json
-import sys
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,11 +18,11 @@ OURS = Path(__file__).parent
 
 def parse[Config](
     config_class: type[Config],
-    flags: Sequence[str] | None = None,
+    flags: Sequence[str],
     config_path: Path | str | None = None,
     epilog: str | None = None,
 ) -> Config:
-    """Read a configuration from flags, the command line's by default, and a YAML file that they are put over.
+    """Read a configuration from flags, and from a YAML file that they are put over.
 
     A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias.
 
@@ -31,9 +30,9 @@ def parse[Config](
         InputError: they do not make a configuration.
         OSError: the file cannot be opened.
     """
-    flags = [_readable(flag) for flag in (sys.argv[1:] if flags is None else flags)]
     with as_input():
-        return ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
+        parser = ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog)
+        return parser.parse_args([_readable(flag) for flag in flags])
 
 
 def _readable(flag: str) -> str:

@@ -25,11 +25,12 @@ class NoiseConfig:
     Args:
         model: `fixed`: `sigma` on every axis (paper, section II); `dart`: the fitted `covariance`; `isotropic`: as
             strong as that covariance, but equal on every axis.
-        sigma: standard deviation per axis of `fixed`, in metres; 0 turns noise off.
+        sigma: standard deviation per axis of `fixed`, in metres; 0 turns it off.
         covariance: 3 x 3, in m2: a policy's error on held-out demonstrations, as `constructskill-fit-noise` writes it.
         fitted_on: what the covariance was fitted on, for the data set's provenance.
         clip: bound on each axis of the executed translation, in metres, with and without noise.
-        phases: names of the phases that are perturbed. GRASP and RELEASE have no noise, to keep contacts clean.
+        phases: names of the phases that are perturbed. By default GRASP and RELEASE are not, to keep
+            contacts clean.
         release_sigma: standard deviation per axis, in metres, of the noise in RELEASE for as long as the jaws are
             closed; the paper has none there. Where a task leaves little play, demonstrations without it never show
             how an object beside its place is brought back.
