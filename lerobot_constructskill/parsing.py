@@ -45,6 +45,13 @@ def _readable(flag: str) -> str:
     return flag
 
 
+def tells_of_bases[Config](config_class: type[Config]) -> type[Config]:
+    """Decorate a configuration so that its `--help` tells of the fields of its bases too, which draccus leaves out."""
+    told = [(base.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0] for base in config_class.__bases__]
+    config_class.__doc__ = "\n".join([(config_class.__doc__ or "").rstrip(), *filter(None, map(str.rstrip, told)), ""])
+    return config_class
+
+
 def decode[Config](config_class: type[Config], fields: Mapping[str, Any]) -> Config:
     """Make a configuration of plain values.
 

@@ -5,8 +5,10 @@ import http.server
 import subprocess
 import sys
 import threading
+import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
+from runpy import run_path
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -22,6 +24,8 @@ LARGEST = 15e6
 
 LOADING = {"link", "script", "img", "video", "source", "iframe"}
 """Elements that a browser fetches without being asked."""
+
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
@@ -52,6 +56,13 @@ def site(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def read(site) -> dict[Path, Reader]:
     return {page: Reader(page) for page in site.rglob("*.html")}
+
+
+@pytest.mark.parametrize(("name", "target"), [script for script in SCRIPTS.items() if "-" in script[0]])
+def test_every_field_of_every_command_is_explained(name, target):
+    command = run_path(str(ROOT / "website/reference.py"))["command"]
+    rows = [line for line in command(name, target).splitlines() if line.startswith("| `--")]
+    assert not [row for row in rows if row.endswith("|  |")]
 
 
 def test_every_link_leads_somewhere(site, read):

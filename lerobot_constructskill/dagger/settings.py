@@ -26,7 +26,7 @@ class DaggerConfig:
         store: folder of everything that is made on the way, each thing once for all commands.
         base: the demonstrations to begin with: a name or file that `constructskill-generate` takes.
         base_episodes: their number; default: what `base` says.
-        training: how the policy is trained, each time from the start.
+        training: how the policy is trained; each time from the start.
         seed: training seed.
         rounds: how often the policy drives; with 0 it is behaviour cloning.
         episodes: episodes a round.

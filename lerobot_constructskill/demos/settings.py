@@ -36,8 +36,8 @@ class GenerateConfig:
         stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
             expert has finished: its last steps, the open hand above the bin, show when to let go.
         labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
-        expert: gains, thresholds and dwells.
-        noise: what is added to the executed action.
+        expert: its gains, thresholds and dwells (metres, steps).
+        noise: what is added to the executed action (metres).
         workers: attempts that run at the same time; the data set does not depend on it.
         executor: what they run on: `processes` of this machine, or `ray` (extra `distributed`; a cluster needs `root`
             on a file system that all its machines share).

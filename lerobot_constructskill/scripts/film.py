@@ -14,13 +14,13 @@ View = Annotated[str, Among(("close", "policy"))]
 
 @dataclass
 class FilmConfig:
-    """Film the scripted expert of a task in one episode."""
+    """Film the scripted expert of a task in one episode, by default without noise."""
 
     task: str = "brick_to_bin"  # a name in `contract.TASKS`
     out: Path | None = None  # the video; default: outputs/<task>.mp4
     view: View = "close"  # a close-up (close), or what the policy sees (policy)
     seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
-    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))  # none by default
+    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
     perturb: str = ""  # axis=level, separated by commas, as in the environment
 
     def __post_init__(self):
