@@ -30,6 +30,8 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"crop": [0.5, 0.0, 0.2, 1.0]}, r"left, top, right and bottom .* got \[0.5, 0.0, 0.2, 1.0\]"),
         ({"crop": [0.1, 0.9]}, r"got \[0.1, 0.9\]"),
         ({"head_hidden_dim": 0}, "from 1 to .*, not 0"),
+        ({"head_hidden_layers": 0}, "from 1 to 16, not 0"),
+        ({"regression_loss": "huber"}, "mse, l1"),
         ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention"),
         ({"readout": "mean", "standardize_features": True}, "readout=cls only, not mean"),
         ({"regression_weight": 0}, "above 0 .* not 0"),

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lerobot_constructskill.policies.frozen_vit.ensembling import ensemble
+from lerobot_constructskill.policies.frozen_vit.heads import REGRESSION_LOSSES
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS, SpatialSoftmax
 
@@ -15,6 +16,7 @@ OTHER = [
     {"action_names": ["dx", "dy", "dz", "dyaw", "gripper"]},
     {"regression_weight": 100.0},
     {"head_hidden_dim": 64},
+    {"head_hidden_dim": 64, "head_hidden_layers": 3, "regression_loss": "l1", "regression_weight": 10.0},
 ]
 VARIANTS = [*ABLATIONS, *OTHER, *({"readout": name, "use_state": True} for name in READOUTS)]
 
@@ -63,9 +65,10 @@ def test_heads_do_not_depend_on_the_backbones_initialisation(make_policy, weight
     torch.testing.assert_close(one.heads.gripper.weight, other.heads.gripper.weight)
 
 
+@pytest.mark.parametrize("regression_loss", REGRESSION_LOSSES)
 @pytest.mark.parametrize("gripper_head", ["bce", "regression"])
-def test_padded_steps_do_not_count(gripper_head, make_policy, make_batch):
-    policy = make_policy(gripper_head=gripper_head)
+def test_padded_steps_do_not_count(gripper_head, regression_loss, make_policy, make_batch):
+    policy = make_policy(gripper_head=gripper_head, regression_loss=regression_loss)
     batch = make_batch(policy)
     changed = {**batch, "action": batch["action"].clone()}
     changed["action"][batch["action_is_pad"]] = 7.0
@@ -73,18 +76,19 @@ def test_padded_steps_do_not_count(gripper_head, make_policy, make_batch):
         torch.testing.assert_close(policy.forward(batch, reduction)[0], policy.forward(changed, reduction)[0])
 
 
-def test_the_loss_is_the_written_one(make_policy, make_batch):
-    policy = make_policy()
+@pytest.mark.parametrize(("regression_loss", "power"), [("mse", 2), ("l1", 1)])
+def test_the_loss_is_the_written_one(regression_loss, power, make_policy, make_batch):
+    policy = make_policy(regression_loss=regression_loss)
     batch = make_batch(policy)
     raw, target, valid = policy._raw_chunk(batch), batch["action"], ~batch["action_is_pad"]
-    squared = (raw[..., :-1] - target[..., :-1])[valid].pow(2).mean()
+    translation = (raw[..., :-1] - target[..., :-1])[valid].abs().pow(power).mean()
     p_open = raw[..., -1].sigmoid()[valid]
     label = target[..., -1][valid] > 0
     entropy = -torch.where(label, p_open, 1 - p_open).log().mean()
-    torch.testing.assert_close(policy.forward(batch)[0], squared + entropy)
+    torch.testing.assert_close(policy.forward(batch)[0], translation + entropy)
     per_sample = policy.forward(batch, reduction="none")[0]
     n_valid = valid.sum(1)
-    torch.testing.assert_close((per_sample * n_valid).sum() / n_valid.sum(), squared + entropy)
+    torch.testing.assert_close((per_sample * n_valid).sum() / n_valid.sum(), translation + entropy)
 
 
 @pytest.mark.parametrize("coeff", [-0.1, 0.0, 0.1])

@@ -21,6 +21,7 @@ FIELDS = [
     {"use_state": True},
     {"standardize_features": True},
     {"head_hidden_dim": 32},
+    {"head_hidden_dim": 32, "head_hidden_layers": 2, "regression_loss": "l1"},
     {"regression_weight": 100.0, "scheduler_warmup_steps": 4},
     *({"readout": name, "use_state": readout.learns} for name, readout in READOUTS.items() if name != "cls"),
 ]

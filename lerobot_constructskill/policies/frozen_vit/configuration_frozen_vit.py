@@ -13,6 +13,7 @@ from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSc
 
 from .backbones import IMAGE_SIZE, check_backbone
 from .features import feature_key
+from .heads import REGRESSION_LOSSES
 from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
@@ -73,8 +74,9 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             those that LeRobot computes, of the whole data set, episodes held out for evaluation included. Only
             for the readout "cls".
         use_state: whether the heads also see the normalised `observation.state`.
-        head_hidden_dim: width of a hidden layer (GELU) in each of the two heads; None makes them linear, as the
+        head_hidden_dim: width of the hidden layers (GELU) in each of the two heads; None makes them linear, as the
             paper does.
+        head_hidden_layers: how many hidden layers each head has, where it has any.
         fps: actions per second. A data set of another rate is refused.
         action_names: channels of `action`, written from the data set: translations in metres and rotations in
             radians, then `gripper` (+1 open, -1 closed).
@@ -85,8 +87,11 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
             exp(-coeff * i). -0.1 is the paper's exp(-0.1 k), where k is the steps since a chunk was predicted: the
             newest has most weight. None takes the newest chunk's first action.
-        regression_weight: weight of the translations' squared error (about 1e-4 m2) relative to the gripper's loss. It
-            matters only with a readout that learns, because both heads then share its parameters.
+        regression_loss: what a translation's error costs: "mse", its square as in the paper, or "l1", its absolute
+            value as in ACT, whose slope does not vanish in the last millimetres.
+        regression_weight: weight of the translations' loss (a squared error of about 1e-4 m2, an absolute one of
+            about 3e-3 m) relative to the gripper's. It matters only with a readout that learns, because both heads
+            then share its parameters.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
             None keeps it constant, as the paper does.
     """
@@ -122,6 +127,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     standardize_features: bool = False
     use_state: bool = False
     head_hidden_dim: Width | None = None
+    head_hidden_layers: Annotated[int, Range(1, 16)] = 1
 
     fps: Annotated[int, Range(1, 1000, unit="Hz")] = 20
     action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
@@ -130,6 +136,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     gripper_threshold: Logit = 0.5
     temporal_ensemble_coeff: Logit | None = -0.1
 
+    regression_loss: Annotated[str, Among(tuple(REGRESSION_LOSSES))] = "mse"
     regression_weight: Weight = 1.0
     optimizer_lr: Rate = 1e-3
     optimizer_weight_decay: Decay = 1e-2

@@ -1,14 +1,18 @@
 """The part that trains: a readout and two linear heads, from tokens to a chunk of actions; and their loss."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+REGRESSION_LOSSES = {"mse": Tensor.square, "l1": Tensor.abs}
+"""What a translation's error costs: the paper's squared error, or the absolute one of ACT (Zhao et al. 2023)."""
+
 
 class ChunkHeads(nn.Module):
-    """Two heads that share no weights (paper, section II), on one vector: linear, or with a hidden layer each.
+    """Two heads that share no weights (paper, section II), on one vector: linear, or with hidden layers.
 
     Args:
         readout: makes that vector of what was pooled of the tokens; it may have parameters of its own.
@@ -16,7 +20,8 @@ class ChunkHeads(nn.Module):
         chunk_size: steps T predicted at once.
         n_regressed: translations (and rotations) R of an action; the gripper makes A = R + 1.
         action_scale: bound of the regression, in metres (and radians).
-        hidden_dim: width of the hidden layer, None for none.
+        hidden_dim: width of the hidden layers, None for none.
+        hidden_layers: how many of them.
     """
 
     def __init__(
@@ -27,13 +32,15 @@ class ChunkHeads(nn.Module):
         n_regressed: int,
         action_scale: float,
         hidden_dim: int | None = None,
+        hidden_layers: int = 1,
     ):
         super().__init__()
         self.chunk_shape = (chunk_size, n_regressed)
         self.action_scale = action_scale
         self.readout = readout
-        self.translation = _head(input_dim, hidden_dim, chunk_size * n_regressed)
-        self.gripper = _head(input_dim, hidden_dim, chunk_size)
+        hidden = [hidden_dim] * hidden_layers if hidden_dim else []
+        self.translation = _head(input_dim, hidden, chunk_size * n_regressed)
+        self.gripper = _head(input_dim, hidden, chunk_size)
 
     def forward(self, pooled: Tensor, state: Tensor | None = None) -> Tensor:
         """Return (B, T, A) for pooled tokens (B, ...): bounded translations, then the gripper's logit or number."""
@@ -44,10 +51,11 @@ class ChunkHeads(nn.Module):
         return torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
 
 
-def _head(input_dim: int, hidden_dim: int | None, output_dim: int) -> nn.Module:
-    if hidden_dim is None:
+def _head(input_dim: int, hidden: list[int], output_dim: int) -> nn.Module:
+    if not hidden:
         return nn.Linear(input_dim, output_dim)
-    return nn.Sequential(nn.Linear(input_dim, hidden_dim), nn.GELU(), nn.Linear(hidden_dim, output_dim))
+    layers = [layer for i, o in pairwise([input_dim, *hidden]) for layer in (nn.Linear(i, o), nn.GELU())]
+    return nn.Sequential(*layers, nn.Linear(hidden[-1], output_dim))
 
 
 class ChunkErrors(NamedTuple):
@@ -55,16 +63,18 @@ class ChunkErrors(NamedTuple):
 
     Args:
         squared: (B, T, R), in m2 (and rad2).
+        regression: (B, T), what the loss takes of translations (and rotations).
         gripper: (B, T), binary cross-entropy or squared error.
         n_valid: (B,) steps that are not padded.
     """
 
     squared: Tensor
+    regression: Tensor
     gripper: Tensor
     n_valid: Tensor
 
     def regression_loss(self) -> Tensor:
-        return self.squared.mean(dim=-1).sum() / self.n_valid.sum()
+        return self.regression.sum() / self.n_valid.sum()
 
     def gripper_loss(self) -> Tensor:
         return self.gripper.sum() / self.n_valid.sum()
@@ -75,11 +85,13 @@ class ChunkErrors(NamedTuple):
 
     def loss_per_sample(self, regression_weight: float) -> Tensor:
         """The mean over each sample's valid steps, (B,)."""
-        errors = regression_weight * self.squared.mean(dim=-1) + self.gripper
+        errors = regression_weight * self.regression + self.gripper
         return errors.sum(dim=1) / self.n_valid.clamp(min=1)
 
 
-def chunk_errors(raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str) -> ChunkErrors:
+def chunk_errors(
+    raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str, regression_loss: str = "mse"
+) -> ChunkErrors:
     """Compare what the heads returned with actions.
 
     Args:
@@ -87,10 +99,12 @@ def chunk_errors(raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str)
         target: (B, T, A), the gripper +1 or -1.
         padded: (B, T), true for steps beyond an episode's end.
         gripper_head: "bce" or "regression".
+        regression_loss: one of `REGRESSION_LOSSES`.
     """
-    squared = (raw[..., :-1] - target[..., :-1]).pow(2).masked_fill(padded[..., None], 0.0)
+    errors = (raw[..., :-1] - target[..., :-1]).masked_fill(padded[..., None], 0.0)
+    regression = REGRESSION_LOSSES[regression_loss](errors).mean(dim=-1)
     if gripper_head == "regression":
         gripper = (raw[..., -1] - target[..., -1]).pow(2)
     else:
         gripper = F.binary_cross_entropy_with_logits(raw[..., -1], (target[..., -1] + 1) / 2, reduction="none")
-    return ChunkErrors(squared, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))
+    return ChunkErrors(errors.square(), regression, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))

@@ -100,6 +100,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             len(config.action_names) - 1,
             config.action_scale,
             config.head_hidden_dim,
+            config.head_hidden_layers,
         )
 
     def get_optim_params(self) -> list[nn.Parameter]:
@@ -281,7 +282,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _chunk_errors(self, batch: dict[str, Tensor]) -> ChunkErrors:
         padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
-        return chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, self.config.gripper_head)
+        config = self.config
+        return chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, config.gripper_head, config.regression_loss)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         return self.heads(*self.head_inputs(batch))

@@ -180,6 +180,7 @@ def _step_together(
 ) -> None:
     """Train `heads` in place."""
     preset, weight = config.get_optimizer_preset(), config.regression_weight
+    kinds = config.gripper_head, config.regression_loss
     stacked, _ = stack_module_state(list(heads))
     parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
     optimizer = preset.build(list(parameters.values()))
@@ -190,7 +191,7 @@ def _step_together(
         target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
         seen = [column[batch].to(config.device).float() for column in inputs]
         raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
-        losses = vmap(lambda *chunk: chunk_errors(*chunk, config.gripper_head).loss(weight))(raw, target, padded)
+        losses = vmap(lambda *chunk: chunk_errors(*chunk, *kinds).loss(weight))(raw, target, padded)
         optimizer.zero_grad()
         losses.sum().backward()
         _clip_each(parameters.values(), preset.grad_clip_norm)
