@@ -25,6 +25,8 @@ from lerobot_constructskill.study.runs import list_runs
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
 SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
+PRECISE = sorted((CONFIGS / "generate" / "precise").glob("*.yaml"))
+PARTS = ("av1_video", "quiet_release")
 DOSES = {0: "fast_noise_free", 2: "dose/sigma_02mm", 5: "dose/sigma_05mm", 10: "fast"} | {
     millimetres: f"dose/sigma_{millimetres}mm" for millimetres in (20, 30)
 }
@@ -48,6 +50,21 @@ def test_generation_configs_are_the_papers(path):
 def test_a_suites_set_is_the_everyday_set_of_its_task(path):
     everyday = generate_config(CONFIGS / "generate" / "fast_wrist.yaml")
     assert generate_config(path) == replace(everyday, task=path.stem)
+
+
+@pytest.mark.parametrize("path", PRECISE, ids=lambda path: path.stem)
+def test_a_precise_set_is_the_everyday_one_with_noise_to_its_end(path):
+    everyday = generate_config(CONFIGS / "generate" / "fast_wrist.yaml")
+    noise = replace(everyday.noise, release_sigma=0.003)
+    precise = replace(everyday, task=path.stem, noise=noise, video="lossless", max_steps=500)
+    assert generate_config(path) == precise
+
+
+def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
+    precise = generate_config(CONFIGS / "generate" / "precise" / "brick_on_brick.yaml")
+    av1, quiet = (generate_config(CONFIGS / "generate" / "parts" / f"{name}.yaml") for name in PARTS)
+    assert replace(av1, video="lossless") == precise != av1
+    assert replace(quiet, noise=precise.noise) == precise != quiet
 
 
 @pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
@@ -88,6 +105,17 @@ def test_the_papers_study_holds_its_52_runs():
     assert set(combinations(backbones, 2)) <= {
         pair for a, b in config.analysis.comparisons for pair in ((a, b), (b, a))
     }
+
+
+def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites():
+    precise, parts, suite = (
+        draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[]).study
+        for name in ("precise", "precise_parts", "suite")
+    )
+    whole, before = (study.variants[name].policy for study, name in ((parts, "precise"), (parts, "as_before")))
+    assert whole == precise.variants["precise"].policy and parts.training == precise.training
+    only = suite.variants["wrist_state_hidden"].policy
+    assert before == {**only, "head_hidden_layers": 1, "regression_loss": "mse"}
 
 
 def test_cut_to_fewer_seeds_every_variant_and_reference_has_them():

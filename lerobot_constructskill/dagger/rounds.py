@@ -90,7 +90,7 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
         with staged(shards / str(episode.seed)) as shard, room_for(folder):
             shard.mkdir()
             if episode.frames:
-                write_episode(repo_id, plan.task, features, episode.frames, shard / EPISODE)
+                write_episode(repo_id, plan.task, features, episode.frames, shard / EPISODE, plan.base.video)
             _save([DrivenEpisode.of(episode)], shard / OUTCOME)
     outcomes = [outcome for seed in plan.seeds(number) for outcome in _read(shards / str(seed) / OUTCOME)]
     roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]

@@ -17,13 +17,11 @@ from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
+from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
 from lerobot_constructskill.progress import Progress, quiet
 
 SHARDS = "shards"
-
-BYTES_PER_IMAGE = 3000
-"""A frame of AV1 video at crf 18 and its rows; the fast set has 2,200 bytes a frame."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ def _check_failures(config: GenerateConfig, failures: int) -> None:
 def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
     longest = config.episodes * config.max_steps
-    needed = 2 * BYTES_PER_IMAGE * longest * len(OBS_TYPES[config.obs_type])
+    needed = 2 * VIDEOS[config.video].bytes_per_image * longest * len(OBS_TYPES[config.obs_type])
     disk = disk_of(root.parent)
     free = shutil.disk_usage(disk).free
     if free < needed:

@@ -9,6 +9,7 @@ from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Ste
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.video import VIDEOS
 
 LABELS = ("clean", "executed")
 
@@ -36,6 +37,8 @@ class GenerateConfig:
         stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
             expert has finished: its last steps, the open hand above the bin, show when to let go.
         labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
+        video: how frames are kept: `av1` (2 KB each, at 40 dB: an edge may move by a pixel) or `lossless` (HEVC, up to
+            30 KB: every pixel as it was rendered, for placing to the millimetre; few browsers play it).
         expert: its gains, thresholds and dwells (metres, steps).
         noise: what is added to the executed action (metres).
         workers: attempts that run at the same time; the data set does not depend on it.
@@ -57,6 +60,7 @@ class GenerateConfig:
     light_robot: bool | None = None
     stop_at_success: bool = True
     labels: Annotated[str, Among(LABELS)] = "clean"
+    video: Annotated[str, Among(tuple(VIDEOS))] = "av1"
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     workers: Workers = 1

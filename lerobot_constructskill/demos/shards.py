@@ -14,6 +14,7 @@ from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.progress import quiet
 
@@ -56,7 +57,7 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
         with room_for(shard):
             if success:
                 features = demonstration_features(task, config.obs_type)
-                write_episode(config.repo_id, task, features, frames, shard / EPISODE)
+                write_episode(config.repo_id, task, features, frames, shard / EPISODE, config.video)
             (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
     return outcome
 
@@ -82,12 +83,15 @@ def _read(path: Path) -> Attempt | None:
         return None
 
 
-def write_episode(repo_id: str, task: Task, features: dict[str, dict], frames: list[dict], root: Path) -> None:
+def write_episode(
+    repo_id: str, task: Task, features: dict[str, dict], frames: list[dict], root: Path, video: str
+) -> None:
     """Write a data set of one episode.
 
     Args:
         features: its columns, as `columns` lists them.
         frames: their values, in order.
+        video: an entry of `VIDEOS`.
     """
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
@@ -100,7 +104,7 @@ def write_episode(repo_id: str, task: Task, features: dict[str, dict], frames: l
             fps=FPS,
             robot_type="panda",
             features=features,
-            rgb_encoder=RGBEncoderConfig(crf=18),
+            rgb_encoder=RGBEncoderConfig(**VIDEOS[video].encoder),
             streaming_encoding=True,
             # A demonstration is written at once; a shorter queue would drop frames that the encoder is late for.
             encoder_queue_maxsize=max(len(frames), 1),

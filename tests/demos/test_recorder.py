@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -15,10 +16,11 @@ from lerobot_constructskill.contract import DEMO_SEED_START, FPS, SIM_STATE, TAS
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.replay import ReplayResult, replay
-from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.columns import SIDECAR, demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, make_expert
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.demos.shards import write_episode
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 pytestmark = pytest.mark.sim
@@ -107,6 +109,32 @@ def test_labels_are_what_was_executed_where_that_is_asked_for():
         np.testing.assert_array_equal(other["action"], one["dart.executed_action"])
         np.testing.assert_array_equal(other["dart.executed_action"], one["dart.executed_action"])
         assert (one["action"][:3] != one["dart.executed_action"][:3]).all()
+
+
+def test_a_lossless_set_has_every_pixel_as_it_was_rendered_and_the_same_bytes_on_any_number_of_cores(tmp_path):
+    config = GenerateConfig("local/exact", str(tmp_path / "set"), episodes=2, video="lossless")
+    summary = record(config)
+    env = ConstructSkillEnv(config.task, episode_length=config.max_steps)
+    expert = make_expert(TASKS[config.task], config.expert)
+    attempts = range(DEMO_SEED_START, DEMO_SEED_START + 2 + len(summary.discarded_seeds))
+    seeds = [seed for seed in attempts if seed not in summary.discarded_seeds]
+    episodes = [demonstrate(env, expert, config.noise, seed)[0] for seed in seeds]
+    env.close()
+    dataset, key = LeRobotDataset("local/exact", root=tmp_path / "set"), "observation.images.base"
+    for row, frame in enumerate(frame for frames in episodes for frame in frames):
+        seen = (dataset[row][key] * 255).round().permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(seen, frame[key])
+    data = open_dataset(dataset.root)
+    assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
+    features, cores = demonstration_features(TASKS[config.task], config.obs_type), os.sched_getaffinity(0)
+    try:
+        for n in (1, len(cores)):
+            os.sched_setaffinity(0, {*sorted(cores)[:n]})
+            write_episode("local/e", TASKS[config.task], features, episodes[0], tmp_path / str(n), config.video)
+    finally:
+        os.sched_setaffinity(0, cores)
+    hashes = [hashlib.sha256(next((tmp_path / str(n)).rglob("*.mp4")).read_bytes()) for n in (1, len(cores))]
+    assert hashes[0].digest() == hashes[1].digest()
 
 
 def test_how_the_set_was_made_travels_with_it(recorded):

@@ -1,0 +1,36 @@
+"""How the cameras' frames are kept: LeRobot's encoders by name, and what a frame takes on the disk."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Video:
+    """An encoder of LeRobot's.
+
+    Args:
+        bytes_per_image: at most, with the rows beside it.
+        encoder: fields of `lerobot.configs.RGBEncoderConfig`.
+    """
+
+    bytes_per_image: int
+    encoder: dict[str, Any] = field(default_factory=dict)
+
+
+ONE_THREAD = "pools=none:frame-threads=1:info=0"
+"""x265 with more threads, or with its note of the CPU, writes other bytes on another machine."""
+
+VIDEOS = {
+    "av1": Video(3_000, {"crf": 18}),
+    "lossless": Video(
+        30_000,
+        {
+            "vcodec": "hevc",
+            "pix_fmt": "gbrp",
+            "crf": None,
+            "g": 10,
+            "preset": "ultrafast",
+            "extra_options": {"x265-params": f"lossless=1:log-level=none:{ONE_THREAD}"},
+        },
+    ),
+}
