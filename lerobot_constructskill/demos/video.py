@@ -9,7 +9,7 @@ class Video:
     """An encoder of LeRobot's.
 
     Args:
-        bytes_per_image: at most, with the rows beside it.
+        bytes_per_image: what a frame takes with its rows, rounded up.
         encoder: fields of `lerobot.configs.RGBEncoderConfig`.
     """
 
@@ -34,3 +34,4 @@ VIDEOS = {
         },
     ),
 }
+"""What `--video` can be; `benchmarks/video.py` measures what each costs."""
