@@ -58,9 +58,9 @@ class GenerateConfig:
     max_failures: Share = 1.0
     seed_start: Seed = DEMO_SEED_START
     light_robot: bool | None = None
-    stop_at_success: bool = True
     labels: Annotated[str, Among(LABELS)] = "clean"
     video: Annotated[str, Among(tuple(VIDEOS))] = "av1"
+    stop_at_success: bool = True
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     workers: Workers = 1
