@@ -34,11 +34,11 @@ class GenerateConfig:
         max_failures: failed attempts, as a fraction of `episodes`, above which the run gives up.
         seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
         light_robot: draw the robot with decimated meshes, as in the environment.
+        labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
+        video: how frames are kept: `av1` (2 KB each, with a loss that fine features show) or `lossless` (HEVC, up to
+            30 KB: every pixel as it was rendered; few browsers play it).
         stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
             expert has finished: its last steps, the open hand above the bin, show when to let go.
-        labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
-        video: how frames are kept: `av1` (2 KB each, at 40 dB: an edge may move by a pixel) or `lossless` (HEVC, up to
-            30 KB: every pixel as it was rendered, for placing to the millimetre; few browsers play it).
         expert: its gains, thresholds and dwells (metres, steps).
         noise: what is added to the executed action (metres).
         workers: attempts that run at the same time; the data set does not depend on it.

@@ -1,6 +1,6 @@
 """How the cameras' frames are kept: LeRobot's encoders by name, and what a frame takes on the disk."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -14,7 +14,7 @@ class Video:
     """
 
     bytes_per_image: int
-    encoder: dict[str, Any] = field(default_factory=dict)
+    encoder: dict[str, Any]
 
 
 ONE_THREAD = "pools=none:frame-threads=1:info=0"

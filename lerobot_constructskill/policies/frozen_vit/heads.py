@@ -62,13 +62,13 @@ class ChunkErrors(NamedTuple):
     """What a batch of chunks is off by; zero where a step is padded.
 
     Args:
-        squared: (B, T, R), in m2 (and rad2).
+        offset: (B, T, R), in metres (and radians).
         regression: (B, T), what the loss takes of translations (and rotations).
         gripper: (B, T), binary cross-entropy or squared error.
         n_valid: (B,) steps that are not padded.
     """
 
-    squared: Tensor
+    offset: Tensor
     regression: Tensor
     gripper: Tensor
     n_valid: Tensor
@@ -101,10 +101,10 @@ def chunk_errors(
         gripper_head: "bce" or "regression".
         regression_loss: one of `REGRESSION_LOSSES`.
     """
-    errors = (raw[..., :-1] - target[..., :-1]).masked_fill(padded[..., None], 0.0)
-    regression = REGRESSION_LOSSES[regression_loss](errors).mean(dim=-1)
+    offset = (raw[..., :-1] - target[..., :-1]).masked_fill(padded[..., None], 0.0)
+    regression = REGRESSION_LOSSES[regression_loss](offset).mean(dim=-1)
     if gripper_head == "regression":
         gripper = (raw[..., -1] - target[..., -1]).pow(2)
     else:
         gripper = F.binary_cross_entropy_with_logits(raw[..., -1], (target[..., -1] + 1) / 2, reduction="none")
-    return ChunkErrors(errors.square(), regression, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))
+    return ChunkErrors(offset, regression, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))

@@ -313,7 +313,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     def _translation_error(self, errors: ChunkErrors) -> tuple[float, int]:
         """The sum of squares over all valid steps, in m2, and how many numbers it is of."""
         metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        return errors.squared[..., metres].sum().item(), int(errors.n_valid.sum()) * len(metres)
+        return errors.offset[..., metres].square().sum().item(), int(errors.n_valid.sum()) * len(metres)
 
 
 def _encoders_sha256(column: Mapping[str, Any] | None) -> str | None:
