@@ -96,12 +96,12 @@ def _other_versions(there: dict[str, str], here: dict[str, str]) -> str:
     return f" (other versions: {'; '.join(told)})" if told else " (with the same versions)"
 
 
-def open_simulator(setting: Setting) -> ConstructSkillEnv:
-    """A setting's environment, without rendering."""
+def open_simulator(setting: Setting, render_backend: str = "none") -> ConstructSkillEnv:
+    """A setting's environment, by default without rendering."""
     return ConstructSkillEnv(
         setting.task,
         episode_length=setting.episode_length,
-        render_backend="none",
+        render_backend=render_backend,
         perturb=setting.perturb,
         perturb_seed=setting.perturb_seed,
     )

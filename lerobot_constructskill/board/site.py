@@ -11,6 +11,7 @@ from lerobot_constructskill.analysis.report.wording import percent, share_range
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports
+from lerobot_constructskill.board.films import films_there, write_films
 from lerobot_constructskill.board.protocol import CLASSES, LEVELS, RANKED_FROM, SUITES
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import plural
@@ -23,11 +24,12 @@ CELLS = (*STAGES, ERROR)
 """What an episode's cell can be."""
 
 
-def write_board(root: Path, out: Path, dataset_id: str | None = None) -> list[Path]:
+def write_board(root: Path, out: Path, dataset_id: str | None = None, films: bool = False) -> list[Path]:
     """Write the pages of a board's folder, and its rows for others.
 
     Args:
         dataset_id: as of `exports.eval_results`, which are not written without it.
+        films: make those that are missing; the pages name all that are there.
 
     Returns:
         The pages.
@@ -35,10 +37,13 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None) -> list[Pa
     Raises:
         MissingError: there is no board.
         InputError: an entry is no submission.
+        OSError: there is nothing to render films with.
     """
     entries = read_entries(root)
+    if films:
+        write_films(entries, out)
     day = datetime.now(UTC).date().isoformat()
-    pages = {f"{suite}.html": _suite_page(suite, entries, day) for suite in SUITES}
+    pages = {f"{suite}.html": _suite_page(suite, entries, out, day) for suite in SUITES}
     pages["index.html"] = _render("index.html", entries=entries, suites=SUITES, day=day)
     for name, text in pages.items():
         with replaced(out / name) as partial:
@@ -47,7 +52,7 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None) -> list[Pa
     return [out / name for name in pages]
 
 
-def _suite_page(name: str, entries: list[Entry], day: str) -> str:
+def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
     own = [entry for entry in entries if entry.said.suite == name]
     columns = list(dict.fromkeys([*SUITES[name].settings, *(one for entry in own for one in entry.said.settings)]))
     # Custom settings may be called as the suite's: they are ranked among themselves.
@@ -65,6 +70,7 @@ def _suite_page(name: str, entries: list[Entry], day: str) -> str:
         classes=CLASSES,
         fewest=RANKED_FROM,
         cells=CELLS,
+        films=lambda entry, column: films_there(entry, column, out),
         table=TABLE,
         day=day,
     )

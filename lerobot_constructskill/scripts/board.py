@@ -14,6 +14,7 @@ class BoardConfig:
 
     root: Path  # the board's folder, with entries/ and verified/
     out: Path = Path("outputs/board")  # folder to write
+    films: bool = False  # also film an episode of each entry's setting that placed and one that did not
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 
     def __post_init__(self):
@@ -26,10 +27,11 @@ def board(config: BoardConfig) -> str:
     Raises:
         MissingError: there is no board.
         InputError: an entry is no submission.
+        OSError: there is nothing to render films with.
     """
     from lerobot_constructskill.board.site import write_board
 
-    pages = write_board(config.root, config.out, config.dataset_id)
+    pages = write_board(config.root, config.out, config.dataset_id, config.films)
     return f"{plural(len(pages), 'page')} written; open {pages[-1]}"
 
 

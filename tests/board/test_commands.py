@@ -1,5 +1,7 @@
 """The commands as a stranger uses them: record, submit, verify, and from fresh starts again."""
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from commands import call
+from torchcodec.decoders import VideoDecoder
 
 from lerobot_constructskill.board.protocol import FIRST_FRESH
 from lerobot_constructskill.board.submission import EPISODES
@@ -60,6 +63,15 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     assert '"level": "re-run"' in (tmp_path / "verified" / "entry.json").read_text()
     said = call("constructskill-verify", f"--root={entry}", *rerun[1:], "--value=cafe", fails=True)
     assert "'cafe' calls for the starts from" in said and "the re-run has others" in said
+
+    shutil.copytree(entry, tmp_path / "board" / "entries" / "mine")
+    for made in (1, 0):
+        call("constructskill-board", f"--root={tmp_path / 'board'}", f"--out={tmp_path / 'site'}", "--films=true")
+        (film,) = tmp_path.glob("site/films/*/*.mp4")  # none of its episodes placed
+        assert len(VideoDecoder(film)) == 4, "three steps, and what was there before"
+        assert str(film.relative_to(tmp_path / "site")) in (tmp_path / "site" / "bins.html").read_text()
+        assert (film.stat().st_mtime != 0) == bool(made), "what is there is not made again"
+        os.utime(film, (0, 0))
 
     content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()
     content[len(content) // 2] ^= 1

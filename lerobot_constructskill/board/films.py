@@ -1,0 +1,76 @@
+"""Films of a board's entries: their actions, executed once more and drawn, so that they need nobody's video."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.pools import cores, open_pool
+from lerobot_constructskill.board.entries import Entry
+from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.replay import open_simulator
+from lerobot_constructskill.board.submission import Claim, is_replayable, width
+from lerobot_constructskill.contract import FPS
+from lerobot_constructskill.lerobot_internals import write_video
+from lerobot_constructskill.progress import Progress, quiet
+
+FILMS = "films"
+"""Folder of the films beside the pages."""
+
+
+def films_there(entry: Entry, setting: str, out: Path) -> dict[str, Claim]:
+    """The films of a setting that are there: path from the board's folder to the episode."""
+    return {path: claim for path, claim in _films(entry, setting).items() if (out / path).exists()}
+
+
+def write_films(entries: Sequence[Entry], out: Path, workers: int | None = None) -> int:
+    """Film what is not filmed yet, and return how many films that were.
+
+    Args:
+        out: the folder of the board's pages.
+        workers: processes; one per core by default.
+
+    Raises:
+        OSError: a worker died, or there is nothing to render with.
+    """
+    missing = [
+        (entry.said.settings[name], claim, out / path)
+        for entry in entries
+        for name in entry.standings
+        for path, claim in _films(entry, name).items()
+        if not (out / path).exists()
+    ]
+    if not missing:
+        return 0
+    # Two at least: with one, the pool is this process, where something may have been opened without rendering.
+    with open_pool("processes", max(2, workers or cores())) as submit:
+        running = [submit(_film, *job) for job in missing]
+        for future in Progress(running, "filming", unit="episode"):
+            future.result()
+    return len(missing)
+
+
+def _films(entry: Entry, setting: str) -> dict[str, Claim]:
+    """The first episode of a setting that placed and the first that did not; another submission's have other paths."""
+    if not is_replayable(entry.said):
+        return {}
+    claims = [one for own in entry.standings[setting].claims.values() for one in own if one.error is None]
+    firsts = [next((one for one in claims if one.placed == placed), None) for placed in (True, False)]
+    folder = f"{FILMS}/{entry.name}_{entry.submission.sha256[:12]}"
+    named = "{0.setting}_seed_{0.training_seed}_start_{0.evaluation_seed}.mp4"
+    return {f"{folder}/{named.format(one)}": one for one in firsts if one is not None}
+
+
+def _film(setting: Setting, claim: Claim, path: Path) -> None:
+    env = open_simulator(setting, "auto")
+    try:
+        env.reset(seed=claim.evaluation_seed)
+        frames = [env.render()]
+        for action in claim.actions.reshape(-1, width(setting)):
+            _, _, terminated, truncated, _ = env.step(action)
+            frames.append(env.render())
+            if terminated or truncated:
+                break
+    finally:
+        env.close()
+    with replaced(path) as partial, quiet():
+        write_video(partial, frames, FPS)
