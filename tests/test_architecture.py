@@ -57,6 +57,8 @@ ARROWS = {
     "board.submission": ("artifacts", "contract", "envs.recording"),
     "board.collect": ("envs.recording", "study.rows"),
     "board.replay": ("artifacts", "envs"),
+    "board.rerun": ("analysis.stats",),
+    "board.films": ("artifacts", "contract"),
     "board.entries": ("analysis.stats", "contract"),
     "board.exports": ("artifacts", "contract"),
     "board.site": ("analysis.report.wording", "artifacts", "contract"),

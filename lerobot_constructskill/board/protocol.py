@@ -40,6 +40,9 @@ PHYSICS = "physx_cpu"
 RERUN_EPISODES = 20
 """Starts of every setting that are run anew for the level re-run."""
 
+RERUN_ALPHA = 0.01
+"""A re-run confirms a submission unless fresh starts went worse with a smaller p-value than this."""
+
 CLAIMED, REPLAYED, RERUN = LEVELS = ("claimed", "replayed", "re-run")
 """What is known of an entry: what its author says; that its actions have the outcomes that it says; that its
 checkpoint does as well on starts that nobody could know when it was submitted."""

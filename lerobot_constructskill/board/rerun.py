@@ -4,18 +4,37 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from lerobot_constructskill.board.protocol import fresh_settings, fresh_start
-from lerobot_constructskill.board.submission import Submission
+import numpy as np
+
+from lerobot_constructskill.analysis.stats.comparisons import holm
+from lerobot_constructskill.analysis.stats.spread import mean_p_value
+from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
+from lerobot_constructskill.board.submission import Claim, Submission
 from lerobot_constructskill.errors import InputError
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Share of episodes that placed in one setting: as submitted, and run anew."""
+    """Share of episodes that placed in one setting: as submitted, and run anew.
+
+    Args:
+        p_value: of a permutation test, two-tailed and corrected by Holm over the settings. Its unit is the start: the
+            checkpoints are the same in both, so starts of one kind could be dealt to the two at random.
+    """
 
     setting: str
     submitted: float
     again: float
+    p_value: float
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether fresh starts went worse than chance explains."""
+        return self.again < self.submitted and self.p_value < RERUN_ALPHA
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.setting} {self.submitted:.0%} submitted, {self.again:.0%} run anew"
 
 
 @dataclass(frozen=True)
@@ -32,12 +51,16 @@ class Comparison:
 
     @property
     def sentence(self) -> str:
-        each = [f"{one.setting} {one.submitted:.0%} submitted, {one.again:.0%} run anew" for one in self.rates]
-        return f"Placed, on its own starts and on fresh ones: {'; '.join(each)}."
+        return f"Placed, on its own starts and on fresh ones: {'; '.join(one.sentence for one in self.rates)}."
 
     @property
     def facts(self) -> dict[str, Any]:
         return {"value": self.value, "settings": {one.setting: [one.submitted, one.again] for one in self.rates}}
+
+    def confirm(self) -> None:
+        """Raise InputError where fresh starts went worse than chance explains."""
+        if worse := [f"{one.sentence} (p = {one.p_value:.2g})" for one in self.rates if one.is_worse]:
+            raise InputError(f"The re-run does not confirm it: {'; '.join(worse)}.")
 
 
 def instructions(submission: Submission, value: str) -> str:
@@ -75,12 +98,20 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
         raise InputError(f"{value!a:.80} calls for the starts from {first} on; the re-run has others.")
     if again.declaration.training_seeds != submission.declaration.training_seeds:
         raise InputError("The re-run does not have the submission's training seeds.")
-    before, after = placed(submission), placed(again)
-    return Comparison(value, [Rates(name, before[name], after[name]) for name in before])
+    names = sorted(submission.declaration.settings)
+    pairs = [(placed(submission, name), placed(again, name)) for name in names]
+    rng = np.random.default_rng(0)  # the same verdict whenever it is asked for
+    p_values = holm([mean_p_value(*pair, rng) for pair in pairs])
+    rows = zip(names, pairs, p_values, strict=True)
+    return Comparison(value, [Rates(name, own.mean(), fresh.mean(), p) for name, (own, fresh), p in rows])
 
 
-def placed(submission: Submission) -> dict[str, float]:
-    """Share of each setting's episodes that placed, over all training seeds; errors count as failed."""
-    claims = sorted(submission.claims, key=lambda claim: claim.setting)
-    groups = {name: list(of) for name, of in groupby(claims, key=lambda claim: claim.setting)}
-    return {name: sum(one.placed for one in of) / len(of) for name, of in groups.items()}
+def placed(submission: Submission, setting: str) -> np.ndarray:
+    """Share of the training seeds that placed, from each start of a setting, (starts,); errors count as failed."""
+    claims = [claim for claim in submission.claims if claim.setting == setting]
+    by_start = groupby(sorted(claims, key=_start), key=_start)
+    return np.array([np.mean([one.placed for one in of]) for _, of in by_start])
+
+
+def _start(claim: Claim) -> int:
+    return claim.evaluation_seed

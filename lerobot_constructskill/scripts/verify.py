@@ -84,6 +84,7 @@ def _rerun(submission, config: VerifyConfig):
     again = read_submission(config.rerun)
     comparison = compare(submission, again, config.value)
     _replayed(again, config)
+    comparison.confirm()
     return comparison
 
 

@@ -1,0 +1,59 @@
+"""A re-run confirms what fresh starts can, and nothing that they cannot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lerobot_constructskill.board.protocol import fresh_settings, fresh_start
+from lerobot_constructskill.board.rerun import compare
+from lerobot_constructskill.board.submission import Claim, Submission, read_submission
+from lerobot_constructskill.errors import InputError
+
+STARTS, VALUE = 50, "beef"
+
+
+@pytest.fixture(scope="module")
+def submission(valid) -> Submission:
+    """A submission of two training seeds that places from every start of its two settings."""
+    whole = read_submission(valid)
+    settings = {name: replace(one, episodes=STARTS) for name, one in whole.declaration.settings.items()}
+    return replace(whole, declaration=replace(whole.declaration, settings=settings), claims=claims(settings, 1.0))
+
+
+def claims(settings, rate: float, seed: int = 0) -> list[Claim]:
+    """Both training seeds place from the same share of starts, drawn at random."""
+    rng = np.random.default_rng(seed)
+    return [
+        Claim(start, placed=bool(success), setting=name, training_seed=training_seed)
+        for name, one in settings.items()
+        for start, success in zip(one.starts, rng.random(one.episodes) < rate, strict=True)
+        for training_seed in (0, 1)
+    ]
+
+
+def rerun(submission: Submission, rate: float, seed: int = 0) -> Submission:
+    settings = fresh_settings(submission.declaration.settings, fresh_start(submission.sha256, VALUE))
+    declaration = replace(submission.declaration, settings=settings)
+    return replace(submission, declaration=declaration, claims=claims(settings, rate, seed))
+
+
+def test_what_only_works_on_public_starts_is_not_confirmed(submission):
+    compare(submission, rerun(submission, 1.0), VALUE).confirm()
+    worse = compare(submission, rerun(submission, 0.5), VALUE)
+    assert all(one.submitted == 1.0 and one.again < 1.0 for one in worse.rates)
+    with pytest.raises(InputError, match=r"does not confirm it: .* 100% submitted, .* run anew \(p = "):
+        worse.confirm()
+
+
+def test_better_on_fresh_starts_is_confirmed(submission):
+    weak = replace(submission, claims=claims(submission.declaration.settings, 0.5))
+    compare(weak, rerun(submission, 1.0), VALUE).confirm()
+
+
+def test_an_honest_submission_is_hardly_ever_refused(submission):
+    refused = 0
+    for seed in range(50):
+        own = replace(submission, claims=claims(submission.declaration.settings, 0.8, seed))
+        refused += any(one.is_worse for one in compare(own, rerun(submission, 0.8, 100 + seed), VALUE).rates)
+    assert refused <= 2
