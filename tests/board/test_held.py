@@ -1,19 +1,22 @@
 """Determinism, held: committed actions have the outcomes, the states and the pictures that they had when recorded.
 
-An update of SAPIEN, ManiSkill, NumPy, torch or Mesa that changes a bit is seen here; docs/leaderboard.md says what to
-do then. States are compared to a micrometre, as their last bits differ by the kind of CPU; pictures by their hash.
+So have the videos of a demonstration. An update of SAPIEN, ManiSkill, NumPy, torch, Mesa or FFmpeg that changes a bit
+is seen here; docs/leaderboard.md says what to do then. States are compared to a micrometre, as their last bits differ
+by the kind of CPU; pictures and videos by their hash.
 `python tests/board/test_held.py` records anew.
 """
 
 import hashlib
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 
 from lerobot_constructskill.board.submission import read_submission, width
 from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import Outcome
 
@@ -46,6 +49,16 @@ def execute(task: str) -> tuple[dict, bool]:
     return {"frames": frames, "states": states}, outcome == claim.outcome
 
 
+def videos(root: Path) -> dict[str, str]:
+    """Hashes of the videos of one demonstration with both cameras, made in a folder.
+
+    Not of its rows: what a CPU without AVX-512 computes of the robot's state can differ in the last bit.
+    """
+    record(GenerateConfig("local/held", str(root), task=TASKS[0], episodes=1, obs_type="pixels_agent_pos"))
+    made = sorted(root.glob("videos/**/*.mp4"))
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in made}
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_nothing_has_changed(task):
     recorded = json.loads(RECORDED.read_text())[task]
@@ -56,5 +69,11 @@ def test_nothing_has_changed(task):
     assert found["frames"] == recorded["frames"], "pictures changed: Mesa, SAPIEN or the scene's looks"
 
 
+def test_the_videos_of_a_demonstration_have_not_changed(tmp_path):
+    assert videos(tmp_path / "set") == json.loads(RECORDED.read_text())["videos"]
+
+
 if __name__ == "__main__":
-    RECORDED.write_text(json.dumps({task: execute(task)[0] for task in TASKS}, indent=1) + "\n")
+    with TemporaryDirectory() as scratch:
+        held = {task: execute(task)[0] for task in TASKS} | {"videos": videos(Path(scratch, "set"))}
+    RECORDED.write_text(json.dumps(held, indent=1) + "\n")
