@@ -22,12 +22,11 @@ def films_there(entry: Entry, setting: str, out: Path) -> dict[str, Claim]:
     return {path: claim for path, claim in _films(entry, setting).items() if (out / path).exists()}
 
 
-def write_films(entries: Sequence[Entry], out: Path, workers: int | None = None) -> int:
+def write_films(entries: Sequence[Entry], out: Path) -> int:
     """Film what is not filmed yet, and return how many films that were.
 
     Args:
         out: the folder of the board's pages.
-        workers: processes; one per core by default.
 
     Raises:
         OSError: a worker died, or there is nothing to render with.
@@ -42,7 +41,7 @@ def write_films(entries: Sequence[Entry], out: Path, workers: int | None = None)
     if not missing:
         return 0
     # Two at least: with one, the pool is this process, where something may have been opened without rendering.
-    with open_pool("processes", max(2, workers or cores())) as submit:
+    with open_pool("processes", max(2, cores())) as submit:
         running = [submit(_film, *job) for job in missing]
         for future in Progress(running, "filming", unit="episode"):
             future.result()
