@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.protocol import Setting
-from lerobot_constructskill.board.replay import open_simulator
+from lerobot_constructskill.board.replay import open_simulator, open_workers
 from lerobot_constructskill.board.submission import Claim, is_replayable, width
 from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.lerobot_internals import write_video
@@ -22,8 +21,8 @@ def films_there(entry: Entry, setting: str, out: Path) -> dict[str, Claim]:
     return {path: claim for path, claim in _films(entry, setting).items() if (out / path).exists()}
 
 
-def write_films(entries: Sequence[Entry], out: Path) -> int:
-    """Film what is not filmed yet, and return how many films that were.
+def write_films(entries: Sequence[Entry], out: Path) -> None:
+    """Film what is not filmed yet.
 
     Args:
         out: the folder of the board's pages.
@@ -39,13 +38,11 @@ def write_films(entries: Sequence[Entry], out: Path) -> int:
         if not (out / path).exists()
     ]
     if not missing:
-        return 0
-    # Two at least: with one, the pool is this process, where something may have been opened without rendering.
-    with open_pool("processes", max(2, cores())) as submit:
+        return
+    with open_workers() as submit:
         running = [submit(_film, *job) for job in missing]
         for future in Progress(running, "filming", unit="episode"):
             future.result()
-    return len(missing)
 
 
 def _films(entry: Entry, setting: str) -> dict[str, Claim]:

@@ -2,11 +2,12 @@
 
 import random
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from itertools import batched, groupby
 
 from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.pools import cores, open_pool
+from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS, Setting
 from lerobot_constructskill.board.submission import Claim, Submission, is_replayable, width
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -65,7 +66,7 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
         for name, claims in groupby(chosen, key=lambda claim: claim.setting)
         for some in batched(claims, TOGETHER)  # noqa: B911  the last one may be shorter
     ]
-    found = _run(jobs, workers or cores(), sum(claim.steps for claim in chosen))
+    found = _run(jobs, workers, sum(claim.steps for claim in chosen))
     here = versions(*DECIDING)
     others = _other_versions(declaration.versions, here)
     return Verdict(
@@ -78,10 +79,9 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
     )
 
 
-def _run(jobs: Sequence[tuple[Setting, Sequence[Claim]]], workers: int, steps: int) -> list[str]:
+def _run(jobs: Sequence[tuple[Setting, Sequence[Claim]]], workers: int | None, steps: int) -> list[str]:
     found: list[str] = []
-    # Two at least: with one, the pool is this process, and it may be rendering already.
-    with open_pool("processes", max(2, workers)) as submit, Progress(total=steps, desc="replay", unit="step") as bar:
+    with open_workers(workers) as submit, Progress(total=steps, desc="replay", unit="step") as bar:
         running = [(submit(_replay, setting, claims), claims) for setting, claims in jobs]
         for future, claims in running:
             found += future.result()
@@ -94,6 +94,15 @@ def _other_versions(there: dict[str, str], here: dict[str, str]) -> str:
     other = {name: ours for name, ours in here.items() if there.get(name) != ours}
     told = [f"{name} {str(there.get(name))[:40]!a} there, {ours} here" for name, ours in other.items()]
     return f" (other versions: {'; '.join(told)})" if told else " (with the same versions)"
+
+
+def open_workers(workers: int | None = None) -> AbstractContextManager[Submit]:
+    """Processes for simulators, one per core by default, and two at least.
+
+    With one, the pool would be this process, and it may have a simulator already: one that renders and one that does
+    not cannot share a process.
+    """
+    return open_pool("processes", max(2, workers or cores()))
 
 
 def open_simulator(setting: Setting, render_backend: str = "none") -> ConstructSkillEnv:

@@ -1,7 +1,7 @@
 """The highest level: the checkpoint evaluated anew, on starts that nobody could know when it was submitted."""
 
+from collections import defaultdict
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_constructskill.analysis.stats.comparisons import holm
 from lerobot_constructskill.analysis.stats.spread import mean_p_value
 from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
-from lerobot_constructskill.board.submission import Claim, Submission
+from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.errors import InputError
 
 
@@ -108,10 +108,8 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
 
 def placed(submission: Submission, setting: str) -> np.ndarray:
     """Share of the training seeds that placed, from each start of a setting, (starts,); errors count as failed."""
-    claims = [claim for claim in submission.claims if claim.setting == setting]
-    by_start = groupby(sorted(claims, key=_start), key=_start)
-    return np.array([np.mean([one.placed for one in of]) for _, of in by_start])
-
-
-def _start(claim: Claim) -> int:
-    return claim.evaluation_seed
+    by_start = defaultdict(list)
+    for claim in submission.claims:
+        if claim.setting == setting:
+            by_start[claim.evaluation_seed].append(claim.placed)
+    return np.array([np.mean(of) for of in by_start.values()])

@@ -65,12 +65,12 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     assert "'cafe' calls for the starts from" in said and "the re-run has others" in said
 
     shutil.copytree(entry, tmp_path / "board" / "entries" / "mine")
-    for made in (1, 0):
+    for made in (True, False):
         call("constructskill-board", f"--root={tmp_path / 'board'}", f"--out={tmp_path / 'site'}", "--films=true")
         (film,) = tmp_path.glob("site/films/*/*.mp4")  # none of its episodes placed
         assert len(VideoDecoder(film)) == 4, "three steps, and what was there before"
         assert str(film.relative_to(tmp_path / "site")) in (tmp_path / "site" / "bins.html").read_text()
-        assert (film.stat().st_mtime != 0) == bool(made), "what is there is not made again"
+        assert (film.stat().st_mtime != 0) == made, "what is there is not made again"
         os.utime(film, (0, 0))
 
     content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()

@@ -11,6 +11,7 @@ from lerobot_constructskill.board.protocol import (
     LEVEL,
     LEVELS,
     PERTURBED_TASK,
+    RERUN_ALPHA,
     SUITES,
     TRAINING_SEEDS,
     Setting,
@@ -53,7 +54,7 @@ def test_the_page_names_the_other_numbers():
     assert f"({', '.join(STAGES)})" in PAGE
     assert all(f"| {level} |" in PAGE for level in LEVELS)
     assert all(f"`{name}`" in PAGE for name in (*About.__dataclass_fields__, *OBSERVES))
-    assert f"{DEMO_SEED_START:,}" in PAGE
+    assert f"{DEMO_SEED_START:,}" in PAGE and f"p below {RERUN_ALPHA:g} in a permutation test" in PAGE
 
 
 def test_a_perturbed_setting_has_its_control():

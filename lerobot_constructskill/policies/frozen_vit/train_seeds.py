@@ -187,7 +187,8 @@ def _step_together(
     n_steps = orders[0].n_steps
     schedule = config.get_scheduler_preset()
     scheduler = schedule.build(optimizer, n_steps) if schedule else None
-    columns = [_Column(values, len(orders) * orders[0].batch_size, config.device) for values in inputs]
+    most = sum(min(order.batch_size, len(order.rows)) for order in orders)
+    columns = [_Column(values, most, config.device) for values in inputs]
     for batch in Progress(_batches(orders), f"training {len(heads)} seeds", n_steps, unit="step"):
         target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
         seen = [column.read(batch) for column in columns]
@@ -206,7 +207,12 @@ def _step_together(
 class _Column:
     """A column of what the heads see, whose batches lie in the same memory one after another.
 
-    A batch of patch features is 30 MB, and fresh memory for it in every step takes half as long as the arithmetic.
+    A batch of patch features is tens of megabytes, and fresh memory for as much in every step costs page faults.
+
+    Args:
+        values: the column, (N, ...).
+        size: rows of the largest batch.
+        device: where the heads are.
     """
 
     def __init__(self, values: Tensor, size: int, device: str):
