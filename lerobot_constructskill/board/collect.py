@@ -60,7 +60,8 @@ def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
         path = store / "runs" / str(row.run) / RECORDINGS
         if not path.is_file():
             raise MissingError(
-                f"'{path}' is missing: runs that were made before actions were kept cannot be replayed."
+                f"'{path}' is missing: give the store in which the run was made; runs from before actions were kept "
+                "cannot be replayed."
             )
         pile += read_recordings(path)
     return piles, failures

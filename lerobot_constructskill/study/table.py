@@ -1,9 +1,13 @@
-"""What there is of a study: its runs as one table of rows, its videos, and what is missing or failed, and why."""
+"""What there is of a study: its runs as one table of rows, its videos, and what is missing or failed, and why.
+
+A run counts as made where the store has it, and also where the table in the study's folder has its rows already: so a
+published study can be gone on with by somebody who has its folder, and none of its checkpoints.
+"""
 
 import json
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -33,6 +37,7 @@ class Table:
         self.root, self.runs, self.store = root, runs, store
         self._made: dict[str, list[EpisodeRow]] = {}
         self._rows: dict[str, list[Row]] = {}
+        self._kept = _finished(root / ROWS)
 
     def missing(self) -> list[Run]:
         """The runs that have not been made."""
@@ -53,7 +58,7 @@ class Table:
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
-        return self._made.get(name)
+        return self._made.get(name) or self._kept.get((run.id, name))
 
     def forget_failure(self, run: Run) -> None:
         """Discard a run that failed, so that it is made anew, unless somebody has done so."""
@@ -82,6 +87,9 @@ class Table:
         return Row(run=run.artifact.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))
 
     def _made_rows(self, run: Run) -> Iterator[Row]:
+        if run.artifact.digest not in self._made:
+            yield from (replace(row, **_names(run)) for row in self.episodes(run))
+            return
         common, errors = _names(run), self._heldout_errors(run)
         if errors:
             common |= {"heldout_mse_m2": errors.get(run.arm.validated_on[0].name)}
@@ -111,6 +119,13 @@ class Table:
             with replaced(self.root / path) as partial:
                 shutil.copy2(video, partial)
         return str(path)
+
+
+def _finished(file: Path) -> dict[tuple[str, str | None], list[Row]]:
+    """The rows of each run in a study's table that ran to its end, by its name and its digest."""
+    rows = [row for row in load_rows(file, Row) if not row.error_kind] if file.exists() else []
+    by_run = groupby(rows, key=lambda row: (f"{row.setting}/{row.variant}/seed_{row.training_seed}", row.run))
+    return {key: list(episodes) for key, episodes in by_run}
 
 
 def _names(run: Run) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 import lerobot_constructskill.plugin  # noqa: F401
@@ -156,6 +157,22 @@ def test_a_whole_study_runs_nothing_and_its_table_is_in_the_studys_order(tmp_pat
     found = [*zip(rows["setting"], rows["variant"], rows["training_seed"], strict=True)]
     assert found == [(run.arm.setting, run.arm.name, run.seed) for run in table.runs]
     assert {path.name for path in table.store.root.iterdir()} == {"runs", "locks"}
+
+
+def test_whoever_has_the_folder_of_a_study_goes_on_with_it_without_its_runs(tmp_path):
+    make_all(study(), tmp_path)
+    published = read_rows(tmp_path / "x" / "rows.parquet")
+    empty = Store(tmp_path / "elsewhere")
+    more = study(variants=study().variants | {"b": Variant(ACT | {"dim_model": 64}, seeds=3), "c": Variant(ACT)})
+    table = Table(tmp_path / "x", list_runs(more), empty)
+    assert {run.id for run in table.missing()} == {"fixed/b/seed_2", *(f"fixed/c/seed_{seed}" for seed in range(10))}
+    table.write()
+    rows = read_rows(tmp_path / "x" / "rows.parquet")
+    pd.testing.assert_frame_equal(rows[rows["error_kind"].isna()].reset_index(drop=True), published)
+    other = list_runs(study(eval_seed=2000))  # the same names, and nothing of them was made
+    assert len(Table(tmp_path / "x", other, empty).missing()) == len(other)
+    run_study(study(), "", tmp_path / "x", empty, Options())  # nothing to run: neither data nor weights exist here
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
 
 
 def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
