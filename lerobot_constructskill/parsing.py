@@ -1,6 +1,7 @@
 """Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
 
 import json
+import shlex
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ import yaml
 
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.lerobot_internals import ArgumentParser
+from lerobot_constructskill.presets import find
 
 OURS = Path(__file__).parent
 
@@ -33,6 +35,23 @@ def parse[Config](
     with as_input():
         parser = ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog)
         return parser.parse_args([_readable(flag) for flag in flags])
+
+
+def parse_named[Config](config_class: type[Config], kind: str, text: str, flags: Sequence[str] = ()) -> Config:
+    """Read what a command line would say of a shipped configuration or a file: `fast --episodes=32`.
+
+    Args:
+        kind: one of `presets.KINDS`.
+        text: the name or the file, and the flags that are put over it, in quotation marks where they hold spaces.
+        flags: others, which go before.
+
+    Raises:
+        MissingError: there is neither such a name nor such a file.
+        InputError: they do not make a configuration.
+    """
+    with as_input():
+        name, *own = shlex.split(text) or [""]
+    return parse(config_class, [*flags, *own], find(kind, name))
 
 
 def _readable(flag: str) -> str:

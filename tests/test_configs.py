@@ -26,10 +26,6 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
 SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
 PRECISE = sorted((CONFIGS / "generate" / "precise").glob("*.yaml"))
-PARTS = ("av1_video", "quiet_release")
-DOSES = {0: "fast_noise_free", 2: "dose/sigma_02mm", 5: "dose/sigma_05mm", 10: "fast"} | {
-    millimetres: f"dose/sigma_{millimetres}mm" for millimetres in (20, 30)
-}
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
 
@@ -58,13 +54,6 @@ def test_a_precise_set_is_the_everyday_one_with_noise_to_its_end(path):
     noise = replace(everyday.noise, release_sigma=0.003)
     precise = replace(everyday, task=path.stem, noise=noise, video="lossless", max_steps=500)
     assert generate_config(path) == precise
-
-
-def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
-    precise = generate_config(CONFIGS / "generate" / "precise" / "brick_on_brick.yaml")
-    av1, quiet = (generate_config(CONFIGS / "generate" / "parts" / f"{name}.yaml") for name in PARTS)
-    assert replace(av1, video="lossless") == precise != av1
-    assert replace(quiet, noise=precise.noise) == precise != quiet
 
 
 @pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
@@ -121,14 +110,6 @@ def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites(
 def test_cut_to_fewer_seeds_every_variant_and_reference_has_them():
     cut = draccus.parse(StudyConfig, CONFIGS / "study" / "dense.yaml", args=["--seeds=4"]).study
     assert {variant.seeds for variant in cut.variants.values()} == {4} and max(cut.references.values()) == 4
-
-
-def test_the_dose_response_is_six_doses_of_fast():
-    fast = generate_config(CONFIGS / "generate" / "fast.yaml")
-    assert set(DOSES.values()) >= {name for name in presets.names("generate") if name.startswith("dose/")}
-    for millimetres, name in DOSES.items():
-        config = generate_config(presets.find("generate", name))
-        assert config == replace(fast, noise=replace(fast.noise, sigma=millimetres / 1000))
 
 
 def test_no_two_generation_configs_make_the_same_set():

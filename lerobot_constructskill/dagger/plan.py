@@ -14,8 +14,7 @@ from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.parsing import parse
-from lerobot_constructskill.presets import find
+from lerobot_constructskill.parsing import parse_named
 from lerobot_constructskill.training.checkpoints import LEARNING, checkpoint_artifact, settle_policy
 from lerobot_constructskill.training.trainers import packages_of
 
@@ -36,9 +35,7 @@ class Plan:
     @cached_property
     def base(self) -> GenerateConfig:
         flags = ["--repo_id=local/any", f"--workers={self.config.workers}"]
-        if self.config.base_episodes:
-            flags.append(f"--episodes={self.config.base_episodes}")
-        base = parse(GenerateConfig, flags, find("generate", self.config.base))
+        base = parse_named(GenerateConfig, "generate", self.config.base, flags)
         if base.labels != "clean":
             raise InputError(f"The base '{self.config.base}' has executed actions as labels; DAgger needs clean ones.")
         return base

@@ -24,8 +24,7 @@ class DaggerConfig:
         policy: fields of a LeRobot policy, `type` among them.
         root: folder to write: `dataset`, `checkpoint` and `rounds.json`; `outputs/dagger/<name>` by default.
         store: folder of everything that is made on the way, each thing once for all commands.
-        base: the demonstrations to begin with: a name or file that `constructskill-generate` takes.
-        base_episodes: their number; default: what `base` says.
+        base: the demonstrations to begin with: a name or file that `constructskill-generate` takes, and flags over it.
         training: how the policy is trained; each time from the start.
         seed: training seed.
         rounds: how often the policy drives; with 0 it is behaviour cloning.
@@ -49,7 +48,6 @@ class DaggerConfig:
     root: Text | None = None
     store: Path = Path("outputs/store")
     base: str = "fast_shifted_wrist"
-    base_episodes: Count | None = None
     training: Training = field(default_factory=Training)
     seed: Seed = 0
     rounds: Annotated[int, Range(0, 1000)] = 3

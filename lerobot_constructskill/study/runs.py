@@ -18,8 +18,7 @@ from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError, UserError
-from lerobot_constructskill.parsing import decode, parse
-from lerobot_constructskill.presets import find
+from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import Study, Variant
@@ -155,7 +154,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
 
 def _dagger_config(variant: Variant) -> DaggerConfig:
     with _inside(f"dagger {variant.dagger}"):
-        return parse(DaggerConfig, ["--repo_id=local/any"], find("dagger", variant.dagger))
+        return parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
 
 
 def _read_dagger(variant: Variant) -> Demonstrations:
@@ -203,7 +202,7 @@ def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 def _read_demonstrations(setting: str, data: str) -> Demonstrations:
     with _inside(f"settings.{setting}, data {data}"):
-        return Demonstrations(data, parse(GenerateConfig, ["--repo_id=local/any"], find("generate", data)))
+        return Demonstrations(data, parse_named(GenerateConfig, "generate", data, ["--repo_id=local/any"]))
 
 
 @contextmanager

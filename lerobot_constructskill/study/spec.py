@@ -18,7 +18,8 @@ class Setting:
     """A data set and the environment that its policies are evaluated in.
 
     Args:
-        data: the demonstrations: a name or file that `constructskill-generate` takes.
+        data: the demonstrations: a name or file that `constructskill-generate` takes, and flags over it, such as
+            `fast --noise.sigma=0.005`.
         env: fields of `--env.type=constructskill`.
     """
 
@@ -34,8 +35,9 @@ class Variant:
         policy: fields of a LeRobot policy, `type` among them.
         seeds: how many training seeds, `first_seed` and those that follow it.
         data: demonstrations to use instead of the setting's, for an ablation of the data.
-        dagger: what `constructskill-dagger` takes, a name or file: each seed is trained on rounds that it drives
-            itself. Only its demonstrations and rounds are used; policy, training and seed are the variant's.
+        dagger: what `constructskill-dagger` takes, a name or file and flags over it: each seed is trained on rounds
+            that it drives itself. Only its demonstrations and rounds are used; policy, training and seed are the
+            variant's.
         settings: names of the settings it runs in; all of them by default.
         training: fields of `Training` that differ from the study's.
         first_seed: the first training seed; results are reported on seeds from 0 on, choices are made on others.

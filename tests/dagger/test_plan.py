@@ -42,7 +42,12 @@ def test_more_rounds_go_on_where_fewer_ended():
 
 @pytest.mark.parametrize(
     "fields",
-    [{"seed": 1}, {"base_episodes": 5}, {"policy": ACT | {"dim_model": 64}}, {"training": Training(epochs=1)}],
+    [
+        {"seed": 1},
+        {"base": "smoke --episodes=5"},
+        {"policy": ACT | {"dim_model": 64}},
+        {"training": Training(epochs=1)},
+    ],
 )
 def test_another_learner_is_another_run_from_the_start(fields):
     assert not {*sum(made(**fields), [])} & {*sum(made(), [])}

@@ -131,6 +131,14 @@ def test_a_moved_generator_file_runs_nothing(tmp_path):
     assert not changed(one, other)
 
 
+def test_flags_over_a_set_are_the_set_that_a_file_with_these_fields_makes(tmp_path):
+    file = tmp_path / "cut set.yaml"
+    file.write_text("task: brick_to_bin\nepisodes: 7\nnoise: {sigma: 0.005, phases: [LIFT, CARRY]}\n")
+    named = "fast_noise_free --episodes=7 --noise.sigma=0.005 '--noise.phases=[LIFT, CARRY]'"
+    from_file, over_name = (study(variants={"a": Variant(ACT, 1, data=data)}) for data in (f"'{file}'", named))
+    assert digests(from_file) == digests(over_name)
+
+
 def test_another_version_of_a_package_is_another_run(monkeypatch):
     from lerobot_constructskill.study import runs
 
@@ -244,6 +252,10 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
             "variants.a.training: .*epochs must be a whole number from 1",
         ),
         ({"variants": {"a": Variant(ACT, settings=["moved"])}}, "Unknown setting 'moved' of variant 'a'"),
+        ({"variants": {"a": Variant(ACT, data="fast --episode=7")}}, "fixed, data fast --episode=7: .*--episode=7"),
+        ({"variants": {"a": Variant(ACT, data="fast 'x")}}, "data fast 'x: No closing quotation"),
+        ({"variants": {"a": Variant(ACT, data="")}, "settings": {"fixed": Setting("", {})}}, "no generate conf.* ''"),
+        ({"variants": {"a": Variant(ACT, dagger="smoke --base=x")}}, "no generate configuration 'x'"),
         ({"variants": {"a": Variant(ACT, data="fasst")}}, "no file and no generate configuration 'fasst'"),
         ({"references": {"oracle": 1}}, "Unknown reference 'oracle'; the references are: no_op"),
         ({"references": {"random": 0}}, "references.random: seeds must be a whole number from 1"),
