@@ -136,7 +136,7 @@ def list_runs(study: Study) -> list[Run]:
             arm = _reference_arm(study, reference, own, common)
             runs += [Run(arm, seed) for seed in range(seeds)]
         for variant_name, variant in study.variants_in(name).items():
-            data = _read_dagger(variant) if variant.dagger else sets[variant.data or setting.data]
+            data = sets[study.data_for(name, variant)]
             arm = _variant_arm(study, variant_name, variant, data, common)
             runs += [Run(arm, seed) for seed in variant.training_seeds]
     return runs
@@ -145,22 +145,17 @@ def list_runs(study: Study) -> list[Run]:
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
         policy = settle_policy(variant.policy)
-    training = _training_of(study, name, variant)
+    training = _training_of(study, common["setting"], name, variant)
     learnt = {"demonstrations": data, "policy": policy, "training": training}
     if variant.dagger:
-        learnt["dagger"] = replace(_dagger_config(variant), policy=variant.policy, training=training)
+        rounds = _dagger_config(variant)
+        learnt["dagger"] = replace(rounds, base=data.name, policy=variant.policy, training=training)
     return Arm(name=name, role=VARIANT, **learnt, **common)
 
 
 def _dagger_config(variant: Variant) -> DaggerConfig:
     with _inside(f"dagger {variant.dagger}"):
         return parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
-
-
-def _read_dagger(variant: Variant) -> Demonstrations:
-    """What a variant's rounds begin with."""
-    plan = Plan(_dagger_config(variant))
-    return Demonstrations(plan.config.base, plan.base)
 
 
 def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
@@ -172,7 +167,9 @@ def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mappin
         base, variant = _variant_with(study, name, reference)
         with _inside(f"references.{name}"):
             policy = settle_policy({**variant.policy, **reference.policy})
-        return replace(arm, demonstrations=data, policy=policy, training=_training_of(study, base, variant))
+        return replace(
+            arm, demonstrations=data, policy=policy, training=_training_of(study, common["setting"], base, variant)
+        )
     return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
 
 
@@ -187,9 +184,11 @@ def _variant_with(study: Study, name: str, reference: Reference) -> tuple[str, V
     raise InputError(f"The reference '{name}' needs a variant whose policy has {fields}, as frozen_vit has.")
 
 
-def _training_of(study: Study, name: str, variant: Variant) -> Training:
+def _training_of(study: Study, setting: str, name: str, variant: Variant) -> Training:
+    with _inside(f"settings.{setting}.training"):
+        training = decode(Training, {**asdict(study.training), **study.settings[setting].training})
     with _inside(f"variants.{name}.training"):
-        return decode(Training, {**asdict(study.training), **variant.training})
+        return decode(Training, {**asdict(training), **variant.training})
 
 
 def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,10 +21,12 @@ class Setting:
         data: the demonstrations: a name or file that `constructskill-generate` takes, and flags over it, such as
             `fast --noise.sigma=0.005`.
         env: fields of `--env.type=constructskill`.
+        training: fields of `Training` that differ from the study's.
     """
 
     data: str
     env: dict[str, Any] = field(default_factory=dict)
+    training: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,13 @@ class Variant:
     Args:
         policy: fields of a LeRobot policy, `type` among them.
         seeds: how many training seeds, `first_seed` and those that follow it.
-        data: demonstrations to use instead of the setting's, for an ablation of the data.
+        data: demonstrations to use instead of the setting's, for an ablation of the data; flags alone, such as
+            `--noise.sigma=0`, go over the setting's.
         dagger: what `constructskill-dagger` takes, a name or file and flags over it: each seed is trained on rounds
-            that it drives itself. Only its demonstrations and rounds are used; policy, training and seed are the
-            variant's.
+            too, which it drives itself. Only the rounds are as said there; demonstrations, policy, training and seed
+            are the variant's.
         settings: names of the settings it runs in; all of them by default.
-        training: fields of `Training` that differ from the study's.
+        training: fields of `Training` that differ from the setting's.
         first_seed: the first training seed; results are reported on seeds from 0 on, choices are made on others.
     """
 
@@ -102,10 +105,6 @@ class Study:
             if unknown:
                 known = ", ".join(self.settings)
                 raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; the settings are: {known}.")
-            if variant.dagger and variant.data:
-                raise InputError(
-                    f"Variant '{name}' has both data and dagger, which brings its own data; give only one."
-                )
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
 
@@ -113,13 +112,18 @@ class Study:
         """The variants that run in a setting, by name."""
         return {name: v for name, v in self.variants.items() if setting in (v.settings or self.settings)}
 
+    def data_for(self, setting: str, variant: Variant) -> str:
+        """The demonstrations that a variant is trained on in a setting."""
+        own, other = self.settings[setting].data, variant.data or ""
+        return f"{own} {other}".strip() if other.startswith("--") else other or own
+
     def data_of(self, setting: str) -> list[str]:
         """All demonstrations that the setting's variants are trained on, its own first.
 
         Every policy of the setting is validated on what is held out of each of them. (The paper validates its policy
         without noise on demonstrations without noise, section IV.)
         """
-        data = (variant.data for variant in self.variants_in(setting).values() if variant.data)
+        data = (self.data_for(setting, variant) for variant in self.variants_in(setting).values())
         return list(dict.fromkeys([self.settings[setting].data, *data]))
 
 

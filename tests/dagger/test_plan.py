@@ -92,3 +92,10 @@ def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives
         assert run.checkpoint.digest == plan.checkpoint(config.rounds).digest
     assert cloned.checkpoint.digest == first.dagger.checkpoint(0).digest
     assert first.checkpoint.digest != second.checkpoint.digest
+
+
+def test_a_studys_rounds_begin_with_the_variants_own_demonstrations():
+    driven = Variant(ACT, seeds=1, data="--episodes=1", dagger="smoke --rounds=2")
+    (run,) = list_runs(Study("x", {"fixed": Setting("fast")}, {"driven": driven}))
+    assert (run.dagger.base.episodes, run.dagger.base.noise.sigma, run.dagger.config.rounds) == (1, 0.01, 2)
+    assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1"
