@@ -1,11 +1,13 @@
 """What the scene looks like: the Panda's light-weight visual meshes and the procedural textures.
 
 Without a GPU a frame's cost is the Panda's 135,000 triangles, so the meshes are decimated once and cached.
-Collision meshes are the original files: physics does not know which robot is drawn.
+Collision meshes are the original files, and so is the list of links that may touch each other, which SAPIEN looks for
+beside a URDF: physics does not know which robot is drawn.
 """
 
 import hashlib
 import os
+import shutil
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -65,7 +67,9 @@ def made_once(name: str, build: Callable[[Path], None]) -> Path:
 def light_panda_urdf() -> str:
     """Path of a Panda URDF whose visual meshes have `LIGHT_TRIANGLES` triangles; made on first use."""
     source = Path(Panda.urdf_path)
-    key = hashlib.sha256(f"{LIGHT_TRIANGLES} {_CREASE_ANGLE} {source}".encode() + source.read_bytes()).hexdigest()[:16]
+    facts = f"{LIGHT_TRIANGLES} {_CREASE_ANGLE} {source}".encode()
+    files = [source.read_bytes(), source.with_suffix(".srdf").read_bytes()]
+    key = hashlib.sha256(b"".join([facts, *files])).hexdigest()[:16]
     return str(made_once(f"panda_light_{key}", lambda folder: _build_light_panda(source, folder)) / source.name)
 
 
@@ -83,6 +87,7 @@ def _build_light_panda(source: Path, folder: Path) -> None:
         light = mesh in visuals
         mesh.attrib["filename"] = str(Path(name).name if light else source.parent / name)
     tree.write(folder / source.name)
+    shutil.copy(source.with_suffix(".srdf"), folder)
 
 
 def _decimate(scene: trimesh.Scene, fraction: float) -> None:

@@ -212,10 +212,19 @@ def test_privileged_state_is_what_the_contract_says(blind):
     }
 
 
-def test_the_light_robot_moves_as_the_original_and_looks_like_it():
-    options = {"obs_mode": "rgb", "render_backend": "auto"}
-    light = make("brick_to_bin", light_robot=True, **options)
-    original = make("brick_to_bin", light_robot=False, **options)
-    torch.testing.assert_close(trajectory(light, seed=1), trajectory(original, seed=1), rtol=0, atol=1e-4)
-    frames = [env.get_obs()["sensor_data"]["base"]["rgb"].float() for env in (light, original)]
+def test_the_light_robot_moves_as_the_original_to_the_last_bit(blind):
+    """Or an episode that was driven with pictures would not be the one that is replayed without."""
+    (task,) = (name for name, row in TASKS.items() if row.env_id == blind.spec.id)
+    light = make(task, light_robot=True)
+    assert torch.equal(trajectory(light, seed=1, steps=30), trajectory(blind, seed=1, steps=30))
+    light.close()
+
+
+def test_the_light_robot_looks_like_the_original():
+    frames = []
+    for light_robot in (True, False):
+        env = make("brick_to_bin", obs_mode="rgb", render_backend="auto", light_robot=light_robot)
+        env.reset(seed=1)
+        frames.append(env.get_obs()["sensor_data"]["base"]["rgb"].float())
+        env.close()
     assert (frames[0] - frames[1]).abs().mean() < 1.0
