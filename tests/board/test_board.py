@@ -4,11 +4,11 @@ import json
 import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from conftest import ENTRIES
 
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.exports import eval_info
@@ -17,7 +17,7 @@ from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 from lerobot_constructskill.errors import InputError, MissingError
 
-BOARD = ENTRIES.parent
+BOARD = Path(__file__).parents[2] / "board"
 
 
 class Page(HTMLParser):
