@@ -17,7 +17,7 @@ from lerobot_constructskill import presets
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
-from lerobot_constructskill.parsing import parse
+from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.runs import list_runs
@@ -73,6 +73,35 @@ def test_a_study_is_runs_that_can_be_made(path):
     """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
     for run in list_runs(draccus.parse(StudyConfig, path, args=[]).study):
         assert all(run.arm.env["task"] == data.config.task for data in run.arm.validated_on)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_no_two_sets_of_a_setting_are_one(path):
+    """A flag over a set that changes nothing would compare a policy with itself."""
+    study = draccus.parse(StudyConfig, path, args=[]).study
+    for setting in study.settings:
+        configs = [
+            parse_named(GenerateConfig, "generate", data, ["--repo_id=local/set"]) for data in study.data_of(setting)
+        ]
+        assert not [(a, b) for a, b in combinations(configs, 2) if a == b]
+
+
+def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
+    study = draccus.parse(StudyConfig, CONFIGS / "study" / "precise_parts.yaml", args=[]).study
+    sets = {run.arm.name: run.arm.demonstrations.config for run in list_runs(study)}
+    precise, av1, quiet = (sets[name] for name in ("precise", "av1_video", "quiet_release"))
+    assert replace(av1, video="lossless") == precise != av1
+    assert replace(quiet, noise=precise.noise) == precise != quiet
+
+
+def test_the_dose_response_is_six_doses_of_one_set():
+    study = draccus.parse(StudyConfig, CONFIGS / "study" / "dart_dagger.yaml", args=[]).study
+    runs = [run for run in list_runs(study) if run.arm.setting == "frames_4k" and run.arm.demonstrations]
+    sets = {run.arm.name: run.arm.demonstrations.config for run in runs}
+    doses = {0: "clean", 10: "fixed"} | {millimetres: f"sigma_{millimetres}mm" for millimetres in (2, 5, 20, 30)}
+    fixed = sets["fixed"]
+    for millimetres, name in doses.items():
+        assert sets[name] == replace(fixed, noise=replace(fixed.noise, sigma=millimetres / 1000))
 
 
 def test_the_papers_study_holds_its_52_runs():

@@ -1,8 +1,8 @@
 """What the scene looks like: the Panda's light-weight visual meshes and the procedural textures.
 
 Without a GPU a frame's cost is the Panda's 135,000 triangles, so the meshes are decimated once and cached.
-Collision meshes are the original files, and so is the list of links that may touch each other, which SAPIEN looks for
-beside a URDF: physics does not know which robot is drawn.
+Collision meshes are the original files, and so is the SRDF, which lists the links whose contact is ignored and which
+SAPIEN looks for beside a URDF: physics does not know which robot is drawn.
 """
 
 import hashlib

@@ -58,7 +58,7 @@ class Table:
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
-        return self._made.get(name) or self._kept.get((run.id, name))
+        return self._made.get(name) or self._kept.get((run.arm.setting, run.arm.name, name))
 
     def forget_failure(self, run: Run) -> None:
         """Discard a run that failed, so that it is made anew, unless somebody has done so."""
@@ -121,10 +121,10 @@ class Table:
         return str(path)
 
 
-def _finished(file: Path) -> dict[tuple[str, str | None], list[Row]]:
-    """The rows of each run in a study's table that ran to its end, by its name and its digest."""
+def _finished(file: Path) -> dict[tuple[str, str, str | None], list[Row]]:
+    """The rows of each run in a study's table that ran to its end, by setting, variant and digest."""
     rows = [row for row in load_rows(file, Row) if not row.error_kind] if file.exists() else []
-    by_run = groupby(rows, key=lambda row: (f"{row.setting}/{row.variant}/seed_{row.training_seed}", row.run))
+    by_run = groupby(rows, key=lambda row: (row.setting, row.variant, row.run))
     return {key: list(episodes) for key, episodes in by_run}
 
 
