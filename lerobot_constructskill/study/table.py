@@ -1,7 +1,7 @@
 """What there is of a study: its runs as one table of rows, its videos, and what is missing or failed, and why.
 
-A run counts as made where the store has it, and also where the table in the study's folder has its rows already: so a
-published study can be gone on with by somebody who has its folder, and none of its checkpoints.
+A run counts as made where the store has it, and also where the table in the study's folder has its rows already: so
+anyone who has the folder of a published study can continue it, without its checkpoints.
 """
 
 import json
