@@ -81,7 +81,7 @@ def play(agents: Mapping[Any, PolicyAgent], env: dict[str, Any]) -> dict[Any, Wa
         watched[number].hand = step.sim["tcp_pose"][:3]
         watched[number].frames.append(step.seen["pixels"]["base"])
 
-    for number, rollout in roll_out(list(agents.values()), env, [1000], on_step=watch):
+    for number, rollout in roll_out(list(agents.values()), env, [1000], on_step=watch, filmed=range(len(names))):
         if rollout.error:
             raise rollout.error
         watched[number].stage = rollout.episodes[0].stage

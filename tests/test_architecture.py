@@ -39,7 +39,7 @@ ARROWS = {
     "dataset.replay": ("contract", "demos", "envs"),
     "features": ("artifacts", "contract", "policies"),
     "rollout": ("contract",),
-    "rollout.agents": ("parsing",),
+    "rollout.agents": ("contract", "parsing"),
     "rollout.lockstep": ("contract", "envs"),
     "rollout.references": ("contract", "demos"),
     "rollout.simulators": ("artifacts", "envs"),

@@ -102,7 +102,7 @@ def drive_all(
         return
     agents = copies(learner, min(together, len(seeds)))
     instruction = get_task(env_kwargs["task"]).instruction
-    with simulators(len(agents), env_kwargs, n_workers) as sims, Progress(unit="step", desc="driving") as bar:
+    with simulators([env_kwargs] * len(agents), n_workers) as sims, Progress(unit="step", desc="driving") as bar:
         lockstep, running = Lockstep(agents), {}
         while seeds or running:
             free = [lane for lane in range(len(agents)) if lane not in running][: len(seeds)]

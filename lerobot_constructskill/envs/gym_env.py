@@ -9,6 +9,7 @@ from gymnasium import spaces
 from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
+    CAMERAS,
     FPS,
     GRIPPER,
     GRIPPER_CLOSED,
@@ -61,9 +62,11 @@ class ConstructSkillEnv(gym.Env):
             times as fast, with no camera in the observation; for checking experts.
         perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them; empty for none.
         perturb_seed: seed of what a perturbation draws once.
+        cameras: those of `obs_type` that are rendered, all by default; one takes half the time of two, and shows the
+            same.
 
     Raises:
-        ValueError: no such task, obs_type, render_backend, axis or level, or an episode_length below 1.
+        ValueError: no such task, obs_type, render_backend, camera, axis or level, or an episode_length below 1.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -78,6 +81,7 @@ class ConstructSkillEnv(gym.Env):
         render_backend: RenderBackend = "auto",
         perturb: str = "",
         perturb_seed: Seed = 0,
+        cameras: tuple[str, ...] | None = None,
     ):
         check_values(ConstructSkillEnv.__init__, locals())
         self._perturbation = Perturbation(perturb, perturb_seed)
@@ -86,11 +90,14 @@ class ConstructSkillEnv(gym.Env):
         self.task_description = self._row.instruction
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
-        self._cameras = () if render_backend == "none" else OBS_TYPES[obs_type]
+        offered = OBS_TYPES[obs_type]
+        if not set(offered).issuperset(cameras := offered if cameras is None else cameras) or not cameras:
+            raise InputError(f"cameras must be some of {', '.join(offered)}, which {obs_type} has, not {cameras}.")
+        self.cameras = () if render_backend == "none" else tuple(name for name in offered if name in cameras)
         self._told = {"task": task, "episode_length": self._max_episode_steps, "obs_type": obs_type}
         self._told |= {"perturb": perturb, "perturb_seed": perturb_seed}
         self._scene_kwargs = {
-            "cameras": self._cameras,
+            "cameras": self.cameras,
             "light_robot": light_robot,
             "render_backend": render_backend,
             "perturbation": self._perturbation,
@@ -103,7 +110,7 @@ class ConstructSkillEnv(gym.Env):
 
     def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-        space = {"pixels": spaces.Dict(dict.fromkeys(self._cameras, image))}
+        space = {"pixels": spaces.Dict(dict.fromkeys(self.cameras, image))}
         if self.obs_type == "pixels_agent_pos":
             space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
         return spaces.Dict(space)
@@ -127,7 +134,10 @@ class ConstructSkillEnv(gym.Env):
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.2 s.
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
-        self._pixel_rng = np.random.default_rng([seed, self._perturbation.seed])
+        numbers = {name: number for number, name in enumerate(CAMERAS)}
+        self._pixel_rngs = {
+            name: np.random.default_rng([seed, self._perturbation.seed, numbers[name]]) for name in self.cameras
+        }
         self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
         return self._observation(obs), self._info(info)
 
@@ -193,9 +203,9 @@ class ConstructSkillEnv(gym.Env):
         return gym.make(
             self._row.env_id,
             num_envs=num_envs,
-            obs_mode="rgb" if self._cameras else "none",
+            obs_mode="rgb" if self.cameras else "none",
             reward_mode="sparse",
-            render_mode="rgb_array" if self._cameras else None,
+            render_mode="rgb_array" if self.cameras else None,
             max_episode_steps=None,
             disable_env_checker=True,
             **self._scene_kwargs,
@@ -218,17 +228,18 @@ class ConstructSkillEnv(gym.Env):
         return np.clip(scaled, -1, 1)
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
-        pixels = {name: self._sensed(obs["sensor_data"][name]["rgb"][0].cpu().numpy()) for name in self._cameras}
+        pictures = {name: obs["sensor_data"][name]["rgb"][0].cpu().numpy() for name in self.cameras}
+        pixels = {name: self._sensed(name, picture) for name, picture in pictures.items()}
         if self.obs_type == "pixels":
             return {"pixels": pixels}
         return {"pixels": pixels, "agent_pos": self.agent_state()}
 
-    def _sensed(self, image: np.ndarray) -> np.ndarray:
+    def _sensed(self, camera: str, image: np.ndarray) -> np.ndarray:
         """`image`, (H, W, 3) uint8, as a noisy sensor sees it."""
         sigma = self._perturbation.amount("sensor")
         if not sigma:
             return image
-        noisy = image + sigma * self._pixel_rng.standard_normal(image.shape)
+        noisy = image + sigma * self._pixel_rngs[camera].standard_normal(image.shape)
         return np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:

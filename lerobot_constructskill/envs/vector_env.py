@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError, MachineError
@@ -116,7 +115,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
             ) from None
 
     def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
-        cameras = OBS_TYPES[self._single.obs_type]
+        cameras = self._single.cameras
         seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in cameras}}
         if self._single.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self._env.agent_state().cpu().numpy().astype(np.float32)

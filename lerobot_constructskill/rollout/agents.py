@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
+from lerobot_constructskill.contract import CAMERAS
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import as_input
 
@@ -33,7 +34,10 @@ class Observation:
 
 
 class Agent(Protocol):
-    """Something that acts in one environment."""
+    """Something that acts in one environment.
+
+    It may have an attribute `cameras`, the names of those that it looks at; without it, it is shown every camera.
+    """
 
     def reset(self, seed: int) -> None:
         """Forget the last episode; `seed` is that of the next one."""
@@ -81,6 +85,13 @@ class PolicyAgent:
             said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
             raise InputError(f"The checkpoint '{checkpoint}' cannot be loaded ({said}).") from error
         return cls(policy, *processors)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that are among the policy's inputs; every camera where it has pictures by other names."""
+        named = {camera.key: name for name, camera in CAMERAS.items()}
+        pictures = self.policy.config.image_features
+        return tuple(named[key] for key in pictures) if pictures.keys() <= named.keys() else tuple(CAMERAS)
 
     def reset(self, seed: int) -> None:
         self.policy.reset()

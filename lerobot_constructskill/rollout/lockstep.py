@@ -1,12 +1,12 @@
 """Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import Outcome
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
@@ -44,6 +44,7 @@ def roll_out(
     seeds: Sequence[int],
     n_workers: int | None = None,
     on_step: OnStep | None = None,
+    filmed: Collection[int] = (),
 ) -> Iterator[tuple[int, Rollout]]:
     """Run every agent through one episode per seed, in `ConstructSkillEnv(**env_kwargs)`.
 
@@ -52,6 +53,7 @@ def roll_out(
 
     Args:
         n_workers: simulator processes; one per core by default.
+        filmed: agents of whom `on_step` is shown every camera; of others, those that the agent looks at.
 
     Yields:
         An agent's number and its outcome, as soon as it has finished or failed.
@@ -62,8 +64,9 @@ def roll_out(
     task = get_task(env_kwargs.get("task", "brick_to_bin"))
     longest = env_kwargs.get("episode_length") or task.horizon
     most = len(agents) * len(seeds) * longest
+    envs = [env_kwargs if i in filmed else env_kwargs | _rendered(agent, env_kwargs) for i, agent in enumerate(agents)]
     with (
-        simulators(len(agents), env_kwargs, n_workers) as sims,
+        simulators(envs, n_workers) as sims,
         Progress(total=most, unit="step", desc="rollout") as bar,
     ):
         lanes = _Lanes(agents, task.instruction, sims, seeds, on_step)
@@ -75,6 +78,13 @@ def roll_out(
             lanes.advance()
             yield from lanes.settled()
         yield from lanes.settled()
+
+
+def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Have rendered what an agent looks at; one camera at least, as a backend that renders is a part of the result."""
+    offered = OBS_TYPES[env_kwargs.get("obs_type", "pixels")]
+    looked = getattr(agent, "cameras", offered)
+    return {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
 
 
 class _Lanes:

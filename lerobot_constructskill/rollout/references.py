@@ -19,6 +19,8 @@ from lerobot_constructskill.rollout.agents import Agent, Observation
 class NoOpAgent:
     """Stands still with the gripper open."""
 
+    cameras = ()
+
     def __init__(self, task: Task):
         self.still = np.zeros(len(task.action_names), dtype=np.float32)
         self.still[-1] = GRIPPER_OPEN

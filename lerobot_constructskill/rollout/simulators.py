@@ -35,7 +35,7 @@ class Step:
 
 
 class Simulators:
-    """Equal environments, spread over worker processes; environment i lives in worker i % workers.
+    """Environments, spread over worker processes; environment i lives in worker i % workers.
 
     Every method takes a mapping from an environment's number and answers with one, in which an environment that raised
     has its exception. They raise `OSError` where a worker died, for want of memory for instance.
@@ -70,16 +70,16 @@ class Simulators:
 
 
 @contextmanager
-def simulators(count: int, env_kwargs: Mapping[str, Any], n_workers: int | None = None) -> Iterator[Simulators]:
-    """Open `count` environments of `ConstructSkillEnv(**env_kwargs)` in `n_workers` processes (one per core)."""
+def simulators(env_kwargs: Sequence[Mapping[str, Any]], n_workers: int | None = None) -> Iterator[Simulators]:
+    """Open a `ConstructSkillEnv(**kwargs)` for each of `env_kwargs` in `n_workers` processes (one per core)."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
-    n_workers = min(count, n_workers or cores())
+    n_workers = min(len(env_kwargs), n_workers or cores())
     processes, connections = [], []
     try:
         for _ in range(n_workers):
             ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, dict(env_kwargs)), daemon=True)
+            process = context.Process(target=_work, args=(theirs, env_kwargs), daemon=True)
             process.start()
             theirs.close()
             processes.append(process)
@@ -100,7 +100,7 @@ def _receive(worker: Connection) -> dict[int, Any]:
         raise MachineError("A simulator's process died; if there was not enough memory, run fewer at once.") from None
 
 
-def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:
+def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> None:
     """Serve environments until the other side hangs up."""
     die_with_parent()
     _use_one_thread()
@@ -111,7 +111,7 @@ def _work(connection: Connection, env_kwargs: dict[str, Any]) -> None:
         except (EOFError, KeyboardInterrupt):
             break
         for number in arguments.keys() - envs.keys():
-            envs[number] = ConstructSkillEnv(**env_kwargs)
+            envs[number] = ConstructSkillEnv(**env_kwargs[number])
         connection.send({number: _attempt(verb, envs[number], argument) for number, argument in arguments.items()})
     for env in envs.values():
         env.close()

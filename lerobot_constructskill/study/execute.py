@@ -136,7 +136,8 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     first, count = job.arm.evaluation["seed"], job.arm.evaluation["episodes"]
     film = FirstEpisode(next((number for number, run in enumerate(runs) if run.seed == FILMED_SEED), None))
     with timed(job.times, "evaluation"):
-        for number, rollout in roll_out(agents, job.arm.env, range(first, first + count), on_step=film.add):
+        starts = range(first, first + count)
+        for number, rollout in roll_out(agents, job.arm.env, starts, on_step=film.add, filmed=[film.number]):
             if rollout.error is not None:
                 _let_through(rollout.error)
                 yield _write_failed(job, runs[number], rollout.error)

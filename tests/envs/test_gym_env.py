@@ -45,6 +45,29 @@ def test_bad_fields_are_refused_in_one_sentence(build, field, value):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize("cameras", [("wrist",), (), ("base", "lidar")])
+def test_cameras_that_an_observation_does_not_have_are_refused(cameras):
+    with pytest.raises(UserError, match="must be some of base, which pixels has"):
+        ConstructSkillEnv(cameras=cameras)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("perturb", ["", "sensor=2"])
+def test_a_camera_shows_the_same_whether_or_not_another_is_rendered(perturb):
+    seen = {}
+    for cameras in (("wrist",), ("base",), None):
+        env = ConstructSkillEnv(obs_type="pixels_agent_pos", perturb=perturb, cameras=cameras)
+        observations = [env.reset(seed=3)[0], *(env.step(UP_CLOSED)[0] for _ in range(3))]
+        assert env.observation_space.contains(observations[-1])
+        seen[cameras] = [{"state": obs["agent_pos"]} | obs["pixels"] for obs in observations]
+        env.close()
+    for cameras in (("wrist",), ("base",)):
+        for one, all_of_them in zip(seen[cameras], seen[None], strict=True):
+            assert one.keys() == {"state", *cameras}
+            for name, value in one.items():
+                np.testing.assert_array_equal(value, all_of_them[name])
+
+
 @pytest.mark.parametrize("field, value", [("max_parallel_tasks", 2), ("fps", 10)])
 def test_what_lerobot_offers_and_the_tasks_cannot_do_is_refused(field, value):
     with pytest.raises(UserError, match=field):

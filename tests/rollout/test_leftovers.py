@@ -11,7 +11,7 @@ SIMULATE = """
 import time
 from lerobot_constructskill.rollout.simulators import simulators
 if __name__ == "__main__":
-    with simulators(2, {"task": "block_to_bin", "render_backend": "none"}, 2) as worlds:
+    with simulators([{"task": "block_to_bin", "render_backend": "none"}] * 2, 2) as worlds:
         print("started", flush=True)
         worlds.reset({0: 1, 1: 2})
         time.sleep(300)

@@ -17,6 +17,7 @@ from lerobot_constructskill.rollout.simulators import Step
 
 pytestmark = [pytest.mark.sim]
 
+IMAGE = PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
 STEPS, SEEDS = 7, [1000, 1001]
 ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial state depends on the seed
 
@@ -24,7 +25,7 @@ ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial 
 def random_agent(config, seed, **fields):
     torch.manual_seed(seed)
     filled = config(**fields)
-    filled.input_features = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+    filled.input_features = {filled.image_key: IMAGE}
     policy = FrozenViTChunkPolicy(filled)
     return PolicyAgent(policy, *make_pre_post_processors(policy.config))
 
@@ -115,6 +116,31 @@ def test_an_encoder_that_fails_takes_those_with_it_that_share_it_and_no_other(co
     hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
     *failed, fine = (rollout for _, rollout in sorted(roll_out([*agents, hover], ENV, SEEDS, n_workers=2)))
     assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2 and fine.error is None
+
+
+class Looking(Broken):
+    """Notes the cameras that it is shown."""
+
+    def __init__(self, cameras):
+        super().__init__(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+        self.cameras = cameras
+
+    def act(self, observation):
+        self.seen = tuple(observation.seen["pixels"])
+        return super().act(observation)
+
+
+def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_every_camera(config):
+    policy = random_agent(config, 0, camera="wrist")
+    unsaid = Looking(None)
+    del unsaid.cameras
+    agents = [Looking(("wrist",)), Looking(("wrist",)), Looking(()), Looking(policy.cameras), unsaid]
+    outcomes = dict(roll_out(agents, ENV | {"obs_type": "pixels_agent_pos"}, SEEDS[:1], n_workers=2, filmed=[1]))
+    assert all(outcome.error is None for outcome in outcomes.values())
+    both = ("base", "wrist")
+    assert [agent.seen for agent in agents] == [("wrist",), both, ("base",), ("wrist",), both]
+    policy.policy.config.input_features = {"observation.images.top": IMAGE}
+    assert policy.cameras == both
 
 
 def test_a_failing_agent_is_recorded_and_the_others_go_on():
