@@ -1,6 +1,8 @@
 """RGB environment steps per second at 224 x 224: our scene, ours with original meshes, and PickCube-v1.
 
-Ours are stepped through LeRobot's vector environment, PickCube-v1 as its users step it. The three take turns, a block
+Also ours with one of its two cameras rendered, and with both.
+
+Ours are stepped through LeRobot's vector environment, PickCube-v1 as its users step it. All take turns, a block
 of steps each, so that a change of the machine's load meets all of them; each is measured by the clock and in CPU time,
 which a busy machine disturbs less. Both with lavapipe's own number of threads and with one, each in its own process.
 PyTorch gets one thread: the simulator's tensors are tiny, and waking a second one for them costs more than it gives.
@@ -18,6 +20,7 @@ from measure import Timer, report
 
 from lerobot_constructskill.contract import IMAGE_SIZE
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 BLOCKS, STEPS = 6, 20
 
@@ -54,9 +57,19 @@ def ours(light_robot: bool):
     return lambda: env.step(action)
 
 
+def with_wrist_camera(cameras: tuple[str, ...]):
+    env = ConstructSkillEnv(
+        obs_type="pixels_agent_pos", cameras=cameras, light_robot=True, render_backend="cpu", episode_length=10_000
+    )
+    env.reset(seed=0)
+    action = np.array([0, 0, 0, 1], dtype=np.float32)
+    return lambda: env.step(action)
+
+
 def measure(threads: str) -> None:
     torch.set_num_threads(1)
     steps = {"ours": ours(True), "original meshes": ours(False), "PickCube-v1": pick_cube()}
+    steps |= {"one camera": with_wrist_camera(("wrist",)), "two cameras": with_wrist_camera(("base", "wrist"))}
     timers = {name: (Timer(), CpuTimer()) for name in steps}
     for step in steps.values():
         step()
@@ -71,6 +84,7 @@ def measure(threads: str) -> None:
         what = f"RGB environment {unit}, {threads}"
         report(what, rates["ours"], "stock PickCube-v1", rates["PickCube-v1"], target=7)
         report(what, rates["ours"], "our scene, original meshes", rates["original meshes"], target=3)
+        report(f"{what}, the wrist camera alone", rates["one camera"], "both cameras", rates["two cameras"])
 
 
 def main() -> None:
