@@ -18,6 +18,7 @@ from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, he
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.parsing import parse, parse_named
+from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.runs import list_runs
@@ -73,6 +74,17 @@ def test_a_study_is_runs_that_can_be_made(path):
     """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
     for run in list_runs(draccus.parse(StudyConfig, path, args=[]).study):
         assert all(run.arm.env["task"] == data.config.task for data in run.arm.validated_on)
+
+
+@pytest.mark.parametrize("name", ["perturbed", "perturbed_paper"])
+def test_a_perturbed_study_has_every_level_of_every_axis_beside_the_task_as_it_is(name):
+    study = draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[])
+    sweeps = {axis: ["control", *(f"{axis}_{level + 1}" for level in range(len(AXES[axis].levels)))] for axis in AXES}
+    assert study.analysis.sweeps == sweeps
+    control = study.settings.pop("control")
+    for setting, of in study.settings.items():
+        perturbed = control.env | {"perturb": "=".join(setting.split("_"))}
+        assert of == replace(control, env=perturbed)
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)

@@ -21,6 +21,8 @@ class Analysis:
         comparisons: pairs of variants that the study declares it will test, the family that Holm's correction covers;
             every pair with equally many planned seeds by default.
         alpha: level of those tests.
+        sweeps: name of what is varied to the settings that differ in it, the one without it first. They stand
+            beside it in one table and one figure, in place of a section each.
 
     Raises:
         InputError: no such tests can be made.
@@ -30,26 +32,32 @@ class Analysis:
     order: list[str] = field(default_factory=list)
     comparisons: list[list[str]] | None = None
     alpha: Level = 0.05
+    sweeps: dict[str, list[str]] = field(default_factory=dict)
 
     def __post_init__(self):
         check(self, "analysis.")
         for pair in self.comparisons or []:
             if len(pair) != 2 or pair[0] == pair[1]:
                 raise InputError(f"A comparison must be a pair of variants, not {pair}.")
+        for name, settings in self.sweeps.items():
+            if len(settings) < 2 or len(set(settings)) < len(settings):
+                raise InputError(f"A sweep must be two settings or more, each once; '{name}' is {settings}.")
 
-    def check(self, variants: Collection[str], others: Collection[str] = ()) -> None:
+    @property
+    def swept(self) -> set[str]:
+        """Settings that have no section of their own."""
+        return {name for settings in self.sweeps.values() for name in settings[1:]}
+
+    def check(self, variants: Collection[str], settings: Collection[str], references: Collection[str] = ()) -> None:
         """Refuse names that the study does not have.
-
-        Args:
-            variants: names that everything here may use.
-            others: those of settings and references, which may have labels.
 
         Raises:
             InputError: a name is unknown.
         """
         _check_known("variant in comparisons", chain.from_iterable(self.comparisons or []), variants)
         _check_known("variant in order", self.order, variants)
-        _check_known("name in labels", self.labels, [*variants, *others])
+        _check_known("name in labels", self.labels, [*variants, *settings, *references, *self.sweeps])
+        _check_known("setting in sweeps", chain.from_iterable(self.sweeps.values()), settings)
 
     def label(self, name: str) -> str:
         return self.labels.get(name, name)

@@ -33,7 +33,7 @@ class StudyConfig(Options, Study):
     def __post_init__(self):
         super().__post_init__()
         Study.__post_init__(self)
-        self.analysis.check(self.variants, [*self.settings, *self.references])
+        self.analysis.check(self.variants, self.settings, self.references)
 
     @property
     def study(self) -> Study:

@@ -197,6 +197,23 @@ def test_declared_comparisons_are_the_family(tmp_path):
     assert moved.declared == 1  # augreg does not run there
 
 
+def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections(tmp_path):
+    sweeps = {"position": ["fixed", "moved"]}
+    findings = findings_of(STUDY, study_rows(), tmp_path, sweeps=sweeps)
+    assert [setting.name for setting in findings.sections] == ["fixed"]
+    assert [line.name for line in findings.swept_lines] == list(STUDY["variants"])
+    drawn = {path.name for path in files(tmp_path)}
+    assert drawn >= {"sweeps.png", "fixed_seeds.png"} and "moved_seeds.png" not in drawn
+    lines = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("| position |")]
+    ran = [(s.label, line.outcomes["placed"].mean.value) for name in STUDY["variants"]
+           for s in findings.settings for line in s.lines if line.name == name]  # fmt: skip
+    assert len(lines) == len(ran) == 11
+    for line, (setting, mean) in zip(lines, ran, strict=True):
+        assert f"| {setting} |" in line and f"| {10 * mean:.1f} (" in line
+    page = Reader((tmp_path / "report.html").read_text())
+    assert "Along each sweep" in page.text and "#moved" not in page.links and "#sweeps" in page.links
+
+
 @pytest.mark.parametrize(
     ("analysis", "said"),
     [
@@ -205,6 +222,8 @@ def test_declared_comparisons_are_the_family(tmp_path):
         ({"labels": {"b": "B"}}, "Unknown name in labels 'b'; the study has: one, two, fixed."),
         ({"comparisons": [["one"]]}, "A comparison must be a pair of variants"),
         ({"comparisons": [["one", "one"]]}, "A comparison must be a pair of variants"),
+        ({"sweeps": {"axis": ["fixed", "moved"]}}, "Unknown setting in sweeps 'moved'; the study has: fixed."),
+        ({"sweeps": {"axis": ["fixed"]}}, "A sweep must be two settings or more, each once; 'axis' is ['fixed']."),
         ({"alpha": 1.0}, "analysis.alpha must be a finite number above 0 and at most 0.5, not 1.0"),
         ({"alpha": float("nan")}, "analysis.alpha must be a finite number above 0 and at most 0.5, not nan"),
         ({"alhpa": 0.1}, "alhpa"),

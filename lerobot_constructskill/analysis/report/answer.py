@@ -11,8 +11,8 @@ SOLVED = 0.9
 
 
 def answer(findings: Findings) -> list[tuple[str, str]]:
-    """(setting's label, its paragraph) for every setting."""
-    return [(setting.label, _paragraph(setting, findings.episodes, findings.alpha)) for setting in findings.settings]
+    """(setting's label, its paragraph) for every setting with a section of its own."""
+    return [(setting.label, _paragraph(setting, findings.episodes, findings.alpha)) for setting in findings.sections]
 
 
 def status(findings: Findings) -> str | None:

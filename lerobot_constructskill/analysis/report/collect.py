@@ -6,7 +6,15 @@ from itertools import combinations, groupby
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.analysis.report.findings import Findings, Line, Outcome, RateTest, SettingFindings, Table
+from lerobot_constructskill.analysis.report.findings import (
+    Findings,
+    Line,
+    Outcome,
+    RateTest,
+    SettingFindings,
+    Sweep,
+    Table,
+)
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.comparisons import compare, holm
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
@@ -33,14 +41,20 @@ def collect(analysis: Analysis, rows: pd.DataFrame) -> Findings:
     planned, runs = rows.drop_duplicates(RUN), seed_outcomes(rows)
     of_variants = planned["role"] == VARIANT
     variants, references = (list(planned.loc[chosen, "variant"].unique()) for chosen in (of_variants, ~of_variants))
-    analysis.check(variants, [*planned["setting"].unique(), *references])
+    analysis.check(variants, list(planned["setting"].unique()), references)
     settings = [
         _setting(analysis, name, own, runs[runs["setting"] == name])
         for name, own in planned.groupby("setting", sort=False)
     ]
+    by_name = {setting.name: setting for setting in settings}
     missing = planned["error_kind"].fillna("") == NOT_RUN
     return Findings(
         settings=settings,
+        swept=analysis.swept,
+        sweeps=[
+            Sweep(analysis.label(name), [by_name[setting] for setting in swept])
+            for name, swept in analysis.sweeps.items()
+        ],
         alpha=analysis.alpha,
         episodes=int(rows["episodes"].iloc[0]),
         first_seed=int(rows["evaluation_seed"].min()),

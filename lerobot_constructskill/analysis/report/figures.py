@@ -9,7 +9,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
+from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings, Sweep
 from lerobot_constructskill.analysis.report.ink import MARKERS, Drawing, Ink, panels
 from lerobot_constructskill.analysis.stats.comparisons import Comparison
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA
@@ -147,6 +147,39 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
     return Drawing(f"{setting.name}_ranking", caption, draw)
 
 
+def sweep_figure(findings: Findings) -> Drawing:
+    """Episodes placed along each sweep: a thin line a seed, a thick one their mean."""
+    sweeps, columns = findings.sweeps, min(4, len(findings.sweeps))
+    variants = findings.swept_lines
+
+    def draw(ink: Ink) -> Figure:
+        rows = -(-len(sweeps) // columns)
+        figure, axes = panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
+        for axis, sweep in zip(axes, sweeps, strict=False):
+            for i, variant in enumerate(variants):
+                _along(axis, sweep, variant, ink.series[i % len(ink.series)], MARKERS[i % len(MARKERS)])
+            names = [fill(setting.label, 10) for setting in sweep.settings]
+            axis.set_xticks(range(len(names)), names, fontsize=7.5)
+            axis.set(title=sweep.label, xlim=(-0.3, len(names) - 0.7))
+            axis.grid(axis="y", linewidth=0.6)
+            axis.set_axisbelow(True)
+        for axis in axes[len(sweeps) :]:
+            axis.set_axis_off()
+        for axis in axes[::columns]:
+            axis.set_ylabel(f"placed of {findings.episodes}")
+        axes[0].set_ylim(-0.04 * findings.episodes, 1.04 * findings.episodes)
+        if len(variants) > 1:
+            handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
+            figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=8)
+        return figure
+
+    caption = (
+        "Episodes that were placed, along what is varied. Thin: one training seed each; thick: their mean. At "
+        "the left of each panel what it is compared with."
+    )
+    return Drawing("sweeps", caption, draw)
+
+
 def detectable_figure(findings: Findings) -> Drawing:
     """The smallest difference that a number of seeds shows."""
     rates = (1.0, 0.9, 0.7, 0.5)
@@ -175,6 +208,18 @@ def detectable_figure(findings: Findings) -> Drawing:
         "shows."
     )
     return Drawing("detectable_difference", caption, draw)
+
+
+def _along(axis: Axes, sweep: Sweep, variant: Line, colour: str, marker: str) -> None:
+    """One variant's seeds, and their mean, over the sweep's settings; a failed seed has placed nothing."""
+    lines = [next((line for line in setting.lines if line.name == variant.name), None) for setting in sweep.settings]
+    made = {x: line.runs.set_index("training_seed") for x, line in enumerate(lines) if line and line.outcomes}
+    if not made:
+        return
+    seeds = pd.DataFrame({x: runs["placed"] for x, runs in made.items()})
+    for _, placed in seeds.iterrows():
+        axis.plot(seeds.columns, placed, color=colour, linewidth=0.7, alpha=0.35)
+    axis.plot(seeds.columns, seeds.mean(), marker=marker, color=colour, markersize=5, label=_wrap(variant.label))
 
 
 def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:

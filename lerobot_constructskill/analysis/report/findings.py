@@ -1,6 +1,7 @@
 """The shapes of what a report says, as numbers: a study has settings, a setting has lines and comparisons."""
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import pandas as pd
@@ -162,11 +163,30 @@ class SettingFindings:
 
 
 @dataclass(frozen=True, eq=False)
+class Sweep:
+    """What comes of varying one thing.
+
+    Args:
+        label: what it is called.
+        settings: those that differ in it, the one without it first.
+    """
+
+    label: str
+    settings: list[SettingFindings]
+
+    def lines(self, variant: str) -> list[tuple[str, Line]]:
+        """(setting's label, line) of a variant wherever it runs."""
+        return [(s.label, line) for s in self.settings for line in s.lines if line.name == variant]
+
+
+@dataclass(frozen=True, eq=False)
 class Findings:
     """What a study shows.
 
     Args:
         settings: what each setting shows.
+        swept: names of those that are shown by their sweeps alone.
+        sweeps: what comes of varying one thing at a time.
         alpha: level of its tests.
         episodes: evaluation episodes of a run.
         first_seed: seed of the first of them.
@@ -178,6 +198,8 @@ class Findings:
     """
 
     settings: list[SettingFindings]
+    swept: set[str]
+    sweeps: list[Sweep]
     alpha: float
     episodes: int
     first_seed: int
@@ -186,3 +208,22 @@ class Findings:
     missing: int
     missing_references: list[tuple[str, str]]
     repeated: tuple[int, int]
+
+    @property
+    def sections(self) -> list[SettingFindings]:
+        """The settings with a section of their own."""
+        return [setting for setting in self.settings if setting.name not in self.swept]
+
+    @property
+    def swept_lines(self) -> list[Line]:
+        """The variants that run in sweeps, a line of each."""
+        lines: dict[str, Line] = {}
+        for setting in chain.from_iterable(sweep.settings for sweep in self.sweeps):
+            for line in setting.lines:
+                lines.setdefault(line.name, line)
+        return list(lines.values())
+
+    @property
+    def failures(self) -> list[tuple[str, str, list[int], str]]:
+        """(setting's label, label, seeds, error) of the failed runs."""
+        return [(setting.label, *failure) for setting in self.settings for failure in setting.failures]

@@ -71,6 +71,7 @@ def write_report(root: Path) -> Path:
         "findings": findings,
         "status": status(findings),
         "sections": _sections(root, findings, rows),
+        "sweeps": picture(figures.sweep_figure(findings), root / "figures") if findings.sweeps else None,
         "power": picture(figures.detectable_figure(findings), root / "figures"),
         "facts": [*provenance(rows), *extra_facts(root / PROVENANCE)],
         "version": metadata.version("lerobot_env_constructskill"),
@@ -103,7 +104,7 @@ def _read_heading(path: Path) -> Heading:
 def _sections(root: Path, findings: Findings, rows: pd.DataFrame) -> list[Section]:
     return [
         Section(setting, paragraph, _pictures(setting, findings.episodes, root), films(root, setting, rows))
-        for setting, (_, paragraph) in zip(findings.settings, answer(findings), strict=True)
+        for setting, (_, paragraph) in zip(findings.sections, answer(findings), strict=True)
     ]
 
 
