@@ -19,7 +19,7 @@ from lerobot_constructskill.policies.frozen_vit.features import close_patches, d
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, passes, save_checkpoint, train_seeds
 from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
 
 
@@ -69,15 +69,16 @@ class FeatureTrainer:
         held_out: Sequence[int],
         store: Store,
     ) -> None:
-        """Train every seed of `writers` and write its checkpoint where its writer says."""
+        """Train every seed of `writers` and write its checkpoint where its writer says, as soon as it is trained."""
         features = obtain_features(config, demonstrations, store)
-        policies = train_seeds(config, features, list(writers), epochs, batch_size, held_out)
-        preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
-        errors = heldout_mse(policies, features, held_out, preprocess)
-        for policy, error, write in zip(policies, errors, writers.values(), strict=True):
-            made_of = {config.backbone: _backbone_line(policy.config)}
-            with write(heldout_mse_m2=error, made_of=made_of) as folder:
-                save_checkpoint(policy, features, folder)
+        for seeds in passes(config, list(writers)):
+            policies = train_seeds(config, features, seeds, epochs, batch_size, held_out)
+            preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
+            errors = heldout_mse(policies, features, held_out, preprocess)
+            for seed, policy, error in zip(seeds, policies, errors, strict=True):
+                made_of = {config.backbone: _backbone_line(policy.config)}
+                with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
+                    save_checkpoint(policy, features, folder)
 
     def heldout_mse(
         self, checkpoints: Sequence[Path], demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store

@@ -1,9 +1,7 @@
 """Many training seeds in one pass over a feature set, each of which ends as an ordinary LeRobot checkpoint.
 
 The heads of every seed are stacked and stepped together. AdamW works element by element, gradients are clipped per
-seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding. Where a
-readout learns, each step reads 100 MB of patch features per seed, and stacking them would only cost memory: the seeds
-then train one after another.
+seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +22,15 @@ from .configuration_frozen_vit import FrozenViTChunkConfig
 from .features import open_patches
 from .heads import ChunkHeads, chunk_errors
 from .modeling_frozen_vit import FrozenViTChunkPolicy
+from .readouts import READOUTS
+
+
+def passes(config: FrozenViTChunkConfig, seeds: Sequence[int]) -> list[Sequence[int]]:
+    """Which seeds are worth training together: all of them, or each by itself where the readout learns.
+
+    Each step then reads 100 MB of patch features per seed, and stacking them would only cost memory.
+    """
+    return [[seed] for seed in seeds] if READOUTS[config.readout].learns else [seeds]
 
 
 def train_seeds(
@@ -59,9 +66,7 @@ def train_seeds(
     rows = torch.nonzero(~_is_among(dataset, held_out)).squeeze(1)
     heads = [_fresh_heads(template, seed) for seed in seeds]
     orders = [_Order(rows, seed, epochs, batch_size) for seed in seeds]
-    at_once = 1 if template.readout.learns else len(seeds)
-    for some in (slice(first, first + at_once) for first in range(0, len(seeds), at_once)):
-        _step_together(heads[some], template.config, inputs, table, orders[some])
+    _step_together(heads, template.config, inputs, table, orders)
     return [_with_heads(template, its_heads) for its_heads in heads]
 
 
