@@ -30,8 +30,8 @@ SEEDS = [2_000_000, 2_000_001, 2_000_002]
 class InThisProcess:
     """`Simulators` of toys."""
 
-    def __init__(self, count):
-        self.envs = [ToyEnv(**ENV) for _ in range(count)]
+    def __init__(self, env_kwargs):
+        self.envs = [ToyEnv(**kwargs) for kwargs in env_kwargs]
 
     def reset(self, seeds):
         return {number: simulators._reset(self.envs[number], seed) for number, seed in seeds.items()}
@@ -48,8 +48,8 @@ class InThisProcess:
 @pytest.fixture(autouse=True)
 def toys(monkeypatch):
     @contextmanager
-    def toy_simulators(count, env_kwargs, n_workers=None):
-        yield InThisProcess(count)
+    def toy_simulators(env_kwargs, n_workers=None):
+        yield InThisProcess(env_kwargs)
 
     monkeypatch.setattr(wheel, "simulators", toy_simulators)
 
