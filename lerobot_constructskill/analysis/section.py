@@ -16,13 +16,13 @@ class Analysis:
     """Labels, order and tests of a report.
 
     Args:
-        labels: name of a setting, variant or reference to what tables call it; the name itself by default.
+        labels: name of a setting, variant, reference or sweep to what tables call it; the name itself by default.
         order: variants that stand first, in this order; the others follow as they stand in the study.
         comparisons: pairs of variants that the study declares it will test, the family that Holm's correction covers;
             every pair with equally many planned seeds by default.
         alpha: level of those tests.
         sweeps: name of what is varied to the settings that differ in it, the one without it first. They stand
-            beside it in one table and one figure, in place of a section each.
+            beside it in one table and one figure, in place of a section each with its comparisons.
 
     Raises:
         InputError: no such tests can be made.
@@ -58,6 +58,11 @@ class Analysis:
         _check_known("variant in order", self.order, variants)
         _check_known("name in labels", self.labels, [*variants, *settings, *references, *self.sweeps])
         _check_known("setting in sweeps", chain.from_iterable(self.sweeps.values()), settings)
+        for name, swept in self.sweeps.items():
+            if name in (*variants, *settings, *references):
+                raise InputError(f"The sweep '{name}' needs a name that nothing else in the study has.")
+            if swept[0] in self.swept:
+                raise InputError(f"'{swept[0]}' begins the sweep '{name}' and must not be varied in another.")
 
     def label(self, name: str) -> str:
         return self.labels.get(name, name)

@@ -197,19 +197,31 @@ def test_declared_comparisons_are_the_family(tmp_path):
     assert moved.declared == 1  # augreg does not run there
 
 
+@pytest.mark.parametrize(
+    ("sweeps", "said"),
+    [
+        ({"clip": ["fixed", "moved"]}, "The sweep 'clip' needs a name that nothing else in the study has."),
+        ({"a": ["fixed", "moved"], "b": ["moved", "fixed"]}, "'fixed' begins the sweep 'a' and must not be varied"),
+    ],
+)
+def test_a_sweep_has_a_name_and_a_beginning_of_its_own(sweeps, said, tmp_path):
+    with pytest.raises(InputError, match=re.escape(said)):
+        findings_of(STUDY, study_rows(), tmp_path, sweeps=sweeps)
+
+
 def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections(tmp_path):
     sweeps = {"position": ["fixed", "moved"]}
     findings = findings_of(STUDY, study_rows(), tmp_path, sweeps=sweeps)
     assert [setting.name for setting in findings.sections] == ["fixed"]
-    assert [line.name for line in findings.swept_lines] == list(STUDY["variants"])
+    assert [line.name for line in findings.swept_lines] == [*STUDY["variants"], *STUDY["references"]]
     drawn = {path.name for path in files(tmp_path)}
     assert drawn >= {"sweeps.png", "fixed_seeds.png"} and "moved_seeds.png" not in drawn
     lines = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("| position |")]
-    ran = [(s.label, line.outcomes["placed"].mean.value) for name in STUDY["variants"]
-           for s in findings.settings for line in s.lines if line.name == name]  # fmt: skip
-    assert len(lines) == len(ran) == 11
-    for line, (setting, mean) in zip(lines, ran, strict=True):
-        assert f"| {setting} |" in line and f"| {10 * mean:.1f} (" in line
+    ran = [(s.label, line.outcomes["placed"]) for name in (*STUDY["variants"], *STUDY["references"])
+           for s in findings.settings for line in s.everything if line.name == name]  # fmt: skip
+    assert len(lines) == len(ran) == 11 + 2 * len(STUDY["references"])
+    for line, (setting, placed) in zip(lines, ran, strict=True):
+        assert f"| {setting} |" in line and f"| {10 * placed.mean.value:.1f}" in line
     page = Reader((tmp_path / "report.html").read_text())
     assert "Along each sweep" in page.text and "#moved" not in page.links and "#sweeps" in page.links
 

@@ -150,15 +150,15 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
 def sweep_figure(findings: Findings) -> Drawing:
     """Episodes placed along each sweep: a thin line a seed, a thick one their mean."""
     sweeps, columns = findings.sweeps, min(4, len(findings.sweeps))
-    variants = findings.swept_lines
+    lines = findings.swept_lines
 
     def draw(ink: Ink) -> Figure:
         rows = -(-len(sweeps) // columns)
         figure, axes = panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
         for axis, sweep in zip(axes, sweeps, strict=False):
-            for i, variant in enumerate(variants):
-                _along(axis, sweep, variant, ink.series[i % len(ink.series)], MARKERS[i % len(MARKERS)])
-            names = [fill(setting.label, 10) for setting in sweep.settings]
+            for i, line in enumerate(lines):
+                _along(axis, sweep, line, ink.series[i % len(ink.series)], MARKERS[i % len(MARKERS)])
+            names = [fill(setting.label, 10, break_long_words=False) for setting in sweep.settings]
             axis.set_xticks(range(len(names)), names, fontsize=7.5)
             axis.set(title=sweep.label, xlim=(-0.3, len(names) - 0.7))
             axis.grid(axis="y", linewidth=0.6)
@@ -168,9 +168,8 @@ def sweep_figure(findings: Findings) -> Drawing:
         for axis in axes[::columns]:
             axis.set_ylabel(f"placed of {findings.episodes}")
         axes[0].set_ylim(-0.04 * findings.episodes, 1.04 * findings.episodes)
-        if len(variants) > 1:
-            handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
-            figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=8)
+        handles = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=8)
         return figure
 
     caption = (
@@ -210,16 +209,17 @@ def detectable_figure(findings: Findings) -> Drawing:
     return Drawing("detectable_difference", caption, draw)
 
 
-def _along(axis: Axes, sweep: Sweep, variant: Line, colour: str, marker: str) -> None:
-    """One variant's seeds, and their mean, over the sweep's settings; a failed seed has placed nothing."""
-    lines = [next((line for line in setting.lines if line.name == variant.name), None) for setting in sweep.settings]
-    made = {x: line.runs.set_index("training_seed") for x, line in enumerate(lines) if line and line.outcomes}
-    if not made:
+def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str) -> None:
+    """Each seed of a variant or reference, and their mean, over the sweep's settings; where nothing ran is a gap."""
+    ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in sweep.lines(of.name)
+           if line.outcomes}  # fmt: skip
+    if not ran:
         return
-    seeds = pd.DataFrame({x: runs["placed"] for x, runs in made.items()})
+    seeds = pd.DataFrame(ran).reindex(columns=[setting.name for setting in sweep.settings])
+    places = range(len(sweep.settings))
     for _, placed in seeds.iterrows():
-        axis.plot(seeds.columns, placed, color=colour, linewidth=0.7, alpha=0.35)
-    axis.plot(seeds.columns, seeds.mean(), marker=marker, color=colour, markersize=5, label=_wrap(variant.label))
+        axis.plot(places, placed, color=colour, linewidth=0.7, alpha=0.35)
+    axis.plot(places, seeds.mean(), marker=marker, color=colour, markersize=5, label=_wrap(of.label))
 
 
 def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:

@@ -174,9 +174,9 @@ class Sweep:
     label: str
     settings: list[SettingFindings]
 
-    def lines(self, variant: str) -> list[tuple[str, Line]]:
-        """(setting's label, line) of a variant wherever it runs."""
-        return [(s.label, line) for s in self.settings for line in s.lines if line.name == variant]
+    def lines(self, name: str) -> list[tuple[SettingFindings, Line]]:
+        """A variant or a reference in each setting where it runs."""
+        return [(setting, line) for setting in self.settings for line in setting.everything if line.name == name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,11 +216,11 @@ class Findings:
 
     @property
     def swept_lines(self) -> list[Line]:
-        """The variants that run in sweeps, a line of each."""
+        """The variants, and then the references, that run in sweeps: a line of each."""
+        settings = list(chain.from_iterable(sweep.settings for sweep in self.sweeps))
         lines: dict[str, Line] = {}
-        for setting in chain.from_iterable(sweep.settings for sweep in self.sweeps):
-            for line in setting.lines:
-                lines.setdefault(line.name, line)
+        for line in chain(*(setting.lines for setting in settings), *(setting.references for setting in settings)):
+            lines.setdefault(line.name, line)
         return list(lines.values())
 
     @property
