@@ -1,4 +1,4 @@
-"""How a study trains frozen_vit: demonstrations through the encoder once, then all seeds together on what came out."""
+"""How a study trains frozen_vit: demonstrations through the encoder once, then the heads on what came out."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -19,16 +19,19 @@ from lerobot_constructskill.policies.frozen_vit.features import close_patches, d
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, passes, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
 
 
 class FeatureTrainer:
     """`training.trainers.Trainer` of frozen_vit."""
 
-    seeds_together = True
     places = ("backbone_path", "backbone_source")
     packages = ("torchcodec", "transformers", "timm", "openvino")
+
+    def seeds_together(self, config: FrozenViTChunkConfig) -> bool:
+        """Where the readout learns, each step reads 100 MB of patch features a seed: stacking only costs memory."""
+        return not READOUTS[config.readout].learns
 
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
         """Write out what `auto` means here, and which weights there are; None where there are none."""
@@ -69,16 +72,15 @@ class FeatureTrainer:
         held_out: Sequence[int],
         store: Store,
     ) -> None:
-        """Train every seed of `writers` and write its checkpoint where its writer says, as soon as it is trained."""
+        """Train every seed of `writers` and write its checkpoint where its writer says."""
         features = obtain_features(config, demonstrations, store)
-        for seeds in passes(config, list(writers)):
-            policies = train_seeds(config, features, seeds, epochs, batch_size, held_out)
-            preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
-            errors = heldout_mse(policies, features, held_out, preprocess)
-            for seed, policy, error in zip(seeds, policies, errors, strict=True):
-                made_of = {config.backbone: _backbone_line(policy.config)}
-                with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
-                    save_checkpoint(policy, features, folder)
+        policies = train_seeds(config, features, list(writers), epochs, batch_size, held_out)
+        preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
+        errors = heldout_mse(policies, features, held_out, preprocess)
+        for policy, error, write in zip(policies, errors, writers.values(), strict=True):
+            made_of = {config.backbone: _backbone_line(policy.config)}
+            with write(heldout_mse_m2=error, made_of=made_of) as folder:
+                save_checkpoint(policy, features, folder)
 
     def heldout_mse(
         self, checkpoints: Sequence[Path], demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store

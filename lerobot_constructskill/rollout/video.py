@@ -20,16 +20,16 @@ class FirstEpisode:
     """
 
     def __init__(self, number: int | None):
-        self.number = number
+        self._number = number
         self._frames: list[np.ndarray] = []
 
     def add(self, number: int, episode: int, action: np.ndarray, step: Step) -> None:
         """`lockstep.OnStep`."""
-        if number == self.number and episode == 0:
+        if number == self._number and episode == 0:
             self._frames.append(step.seen["pixels"][CAMERA])
 
     def write(self, number: int, path: Path) -> None:
         """Write the video, if the agent is the one that was filmed."""
-        if number == self.number and self._frames:
+        if number == self._number and self._frames:
             with quiet():
                 write_video(path, self._frames, FPS)

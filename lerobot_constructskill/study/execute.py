@@ -89,7 +89,7 @@ def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
     trainer, failed = trainer_of(arm.policy), {}
     with job.store.claim([run.checkpoint for run in runs]) as claimed:
         missing = [run for run in runs if run.checkpoint in claimed]
-        at_once = trainer.seeds_together and not arm.dagger  # each seed drives its own rounds
+        at_once = trainer.seeds_together(arm.policy) and not arm.dagger  # each seed drives its own rounds
         for some in [missing] if at_once and missing else [[run] for run in missing]:
             try:
                 _fit(job, some)
@@ -134,10 +134,11 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
         return
     runs, agents = zip(*ready, strict=True)
     first, count = job.arm.evaluation["seed"], job.arm.evaluation["episodes"]
-    film = FirstEpisode(next((number for number, run in enumerate(runs) if run.seed == FILMED_SEED), None))
+    filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
+    film = FirstEpisode(next(iter(filmed), None))
     with timed(job.times, "evaluation"):
         starts = range(first, first + count)
-        for number, rollout in roll_out(agents, job.arm.env, starts, on_step=film.add, filmed=[film.number]):
+        for number, rollout in roll_out(agents, job.arm.env, starts, on_step=film.add, filmed=filmed):
             if rollout.error is not None:
                 _let_through(rollout.error)
                 yield _write_failed(job, runs[number], rollout.error)

@@ -33,8 +33,6 @@ to say of the checkpoint: `heldout_mse_m2`, its error on what is held out, and `
 class Trainer:
     """Trains a policy type. A configuration class names its own as `study_trainer = "module:class"`."""
 
-    seeds_together: bool = False
-    """Whether `fit` should get many seeds at once."""
     places: tuple[str, ...] = ()
     """Fields of the configuration that say where something lies and do not show in a checkpoint's weights."""
     packages: tuple[str, ...] = ()
@@ -42,6 +40,10 @@ class Trainer:
     heldout_mse: Callable[..., list[float | None]] | None = None
     """`(checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on episodes of
     other demonstrations, in m2; None where they lack one of its inputs. Without it, none is validated on others."""
+
+    def seeds_together(self, config: PreTrainedConfig) -> bool:
+        """Whether `fit` should get many seeds at once: they are then kept, or fail, together."""
+        return False
 
     def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:
         """Return the configuration with everything written out that it leaves to the machine."""

@@ -47,7 +47,8 @@ class LateACTConfig(ACTConfig):
 
 
 class LateTrainer(Trainer):
-    seeds_together = True
+    def seeds_together(self, config):
+        return True
 
     def fit(self, config, demonstrations, writers, epochs, batch_size, held_out, store):
         import torch

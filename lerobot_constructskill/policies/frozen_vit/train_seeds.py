@@ -22,15 +22,6 @@ from .configuration_frozen_vit import FrozenViTChunkConfig
 from .features import open_patches
 from .heads import ChunkHeads, chunk_errors
 from .modeling_frozen_vit import FrozenViTChunkPolicy
-from .readouts import READOUTS
-
-
-def passes(config: FrozenViTChunkConfig, seeds: Sequence[int]) -> list[Sequence[int]]:
-    """Which seeds are worth training together: all of them, or each by itself where the readout learns.
-
-    Each step then reads 100 MB of patch features per seed, and stacking them would only cost memory.
-    """
-    return [[seed] for seed in seeds] if READOUTS[config.readout].learns else [seeds]
 
 
 def train_seeds(
@@ -44,7 +35,7 @@ def train_seeds(
     """Train one policy per seed on a feature set, and return them in the order of the seeds.
 
     A seed decides the first weights of its heads, as in `lerobot-train --seed`, and the order of its samples. The
-    policies share one backbone.
+    policies share one backbone. Where the readout learns, each step holds 30 MB and more of patch features per seed.
 
     Args:
         epochs: passes over the episodes that are not held out.
