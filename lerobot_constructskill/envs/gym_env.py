@@ -1,5 +1,6 @@
 """One environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
 
+import zlib
 from typing import Annotated, Any
 
 import gymnasium as gym
@@ -9,7 +10,6 @@ from gymnasium import spaces
 from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
-    CAMERAS,
     FPS,
     GRIPPER,
     GRIPPER_CLOSED,
@@ -134,9 +134,9 @@ class ConstructSkillEnv(gym.Env):
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.2 s.
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
-        numbers = {name: number for number, name in enumerate(CAMERAS)}
         self._pixel_rngs = {
-            name: np.random.default_rng([seed, self._perturbation.seed, numbers[name]]) for name in self.cameras
+            name: np.random.default_rng([seed, self._perturbation.seed, zlib.crc32(f"sensor {name}".encode())])
+            for name in self.cameras
         }
         self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
         return self._observation(obs), self._info(info)

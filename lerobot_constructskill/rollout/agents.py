@@ -88,10 +88,13 @@ class PolicyAgent:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that are among the policy's inputs; every camera where it has pictures by other names."""
+        """The cameras that are among the policy's inputs; every camera where it knows pictures by other names."""
         named = {camera.key: name for name, camera in CAMERAS.items()}
         pictures = self.policy.config.image_features
-        return tuple(named[key] for key in pictures) if pictures.keys() <= named.keys() else tuple(CAMERAS)
+        renamed = any(getattr(step, "rename_map", None) for step in getattr(self.preprocessor, "steps", ()))
+        if renamed or not pictures.keys() <= named.keys():
+            return tuple(CAMERAS)
+        return tuple(named[key] for key in pictures)
 
     def reset(self, seed: int) -> None:
         self.policy.reset()

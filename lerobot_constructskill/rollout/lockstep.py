@@ -64,7 +64,7 @@ def roll_out(
     task = get_task(env_kwargs.get("task", "brick_to_bin"))
     longest = env_kwargs.get("episode_length") or task.horizon
     most = len(agents) * len(seeds) * longest
-    envs = [env_kwargs if i in filmed else env_kwargs | _rendered(agent, env_kwargs) for i, agent in enumerate(agents)]
+    envs = [env_kwargs if i in filmed else _rendered(agent, env_kwargs) | env_kwargs for i, agent in enumerate(agents)]
     with (
         simulators(envs, n_workers) as sims,
         Progress(total=most, unit="step", desc="rollout") as bar,
@@ -82,7 +82,7 @@ def roll_out(
 
 def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Have rendered what an agent looks at; one camera at least, as a backend that renders is a part of the result."""
-    offered = OBS_TYPES[env_kwargs.get("obs_type", "pixels")]
+    offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
     looked = getattr(agent, "cameras", offered)
     return {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
 

@@ -1,5 +1,7 @@
 """Rollouts in lockstep are `lerobot-eval`'s, step for step, and a policy that fails takes none down with it."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -130,7 +132,7 @@ class Looking(Broken):
         return super().act(observation)
 
 
-def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_every_camera(config):
+def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_every_camera(config, monkeypatch):
     policy = random_agent(config, 0, camera="wrist")
     unsaid = Looking(None)
     del unsaid.cameras
@@ -139,6 +141,9 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
     assert all(outcome.error is None for outcome in outcomes.values())
     both = ("base", "wrist")
     assert [agent.seen for agent in agents] == [("wrist",), both, ("base",), ("wrist",), both]
+    monkeypatch.setattr(policy, "preprocessor", SimpleNamespace(steps=[SimpleNamespace(rename_map={"here": "there"})]))
+    assert policy.cameras == both
+    monkeypatch.undo()
     policy.policy.config.input_features = {"observation.images.top": IMAGE}
     assert policy.cameras == both
 
