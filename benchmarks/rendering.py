@@ -1,6 +1,6 @@
 """RGB environment steps per second at 224 x 224: our scene, ours with original meshes, and PickCube-v1.
 
-Also ours with one of its two cameras rendered, and with both.
+Also ours as a Gymnasium environment with one of its two cameras rendered, and with both.
 
 Ours are stepped through LeRobot's vector environment, PickCube-v1 as its users step it. All take turns, a block
 of steps each, so that a change of the machine's load meets all of them; each is measured by the clock and in CPU time,
@@ -57,7 +57,7 @@ def ours(light_robot: bool):
     return lambda: env.step(action)
 
 
-def with_wrist_camera(cameras: tuple[str, ...]):
+def of_two_cameras(cameras: tuple[str, ...]):
     env = ConstructSkillEnv(
         obs_type="pixels_agent_pos", cameras=cameras, light_robot=True, render_backend="cpu", episode_length=10_000
     )
@@ -69,7 +69,7 @@ def with_wrist_camera(cameras: tuple[str, ...]):
 def measure(threads: str) -> None:
     torch.set_num_threads(1)
     steps = {"ours": ours(True), "original meshes": ours(False), "PickCube-v1": pick_cube()}
-    steps |= {"one camera": with_wrist_camera(("wrist",)), "two cameras": with_wrist_camera(("base", "wrist"))}
+    steps |= {"one camera": of_two_cameras(("wrist",)), "two cameras": of_two_cameras(("base", "wrist"))}
     timers = {name: (Timer(), CpuTimer()) for name in steps}
     for step in steps.values():
         step()
