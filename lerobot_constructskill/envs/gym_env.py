@@ -62,8 +62,7 @@ class ConstructSkillEnv(gym.Env):
             times as fast, with no camera in the observation; for checking experts.
         perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them; empty for none.
         perturb_seed: seed of what a perturbation draws once.
-        cameras: those of `obs_type` that are rendered, all by default; one takes half the time of two, and shows the
-            same.
+        cameras: those of `obs_type` that are rendered, all by default; one is faster than two, and shows the same.
 
     Raises:
         ValueError: no such task, obs_type, render_backend, camera, axis or level, or an episode_length below 1.

@@ -30,7 +30,7 @@ class FeatureTrainer:
     packages = ("torchcodec", "transformers", "timm", "openvino")
 
     def seeds_together(self, config: FrozenViTChunkConfig) -> bool:
-        """Where the readout learns, each step reads 100 MB of patch features a seed: stacking only costs memory."""
+        """Where the readout learns, each step reads tens of megabytes a seed: stacking only costs memory."""
         return not READOUTS[config.readout].learns
 
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:

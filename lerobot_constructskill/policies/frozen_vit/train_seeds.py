@@ -35,7 +35,7 @@ def train_seeds(
     """Train one policy per seed on a feature set, and return them in the order of the seeds.
 
     A seed decides the first weights of its heads, as in `lerobot-train --seed`, and the order of its samples. The
-    policies share one backbone. Where the readout learns, each step holds 30 MB and more of patch features per seed.
+    policies share one backbone. Where the readout learns, each step holds tens of megabytes of patches per seed.
 
     Args:
         epochs: passes over the episodes that are not held out.
