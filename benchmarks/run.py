@@ -1,6 +1,8 @@
 """`make bench`: every benchmark in one run, one after another, and the table benchmarks/RESULTS.md.
 
-Usage: python benchmarks/run.py [name ...]   (rendering encoders training evaluation drift scaling; all by default)
+Usage: python benchmarks/run.py [name ...]
+
+The names are rendering, resets, encoders, training, evaluation, drift and scaling; all by default.
 
 Named ones are measured again and the others keep their last lines. Demonstrations and features of the fast set are
 made on the first run, in outputs/bench ($BENCH_OUT).
@@ -20,7 +22,7 @@ from measure import BIN, OUT, run
 from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, native_precision
 
 HERE = Path(__file__).parent
-NAMES = ("rendering", "encoders", "training", "evaluation", "drift", "scaling")
+NAMES = ("rendering", "resets", "encoders", "training", "evaluation", "drift", "scaling")
 PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "openvino", "onnxruntime")
 LINES = HERE / "results.jsonl"
 

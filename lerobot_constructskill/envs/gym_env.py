@@ -1,5 +1,8 @@
 """One environment as LeRobot wants it: Gymnasium's API, numpy in and out, metres in the action."""
 
+import functools
+import gc
+import multiprocessing
 import zlib
 from typing import Annotated, Any
 
@@ -199,6 +202,7 @@ class ConstructSkillEnv(gym.Env):
         except ModuleNotFoundError as error:  # Gymnasium's worker processes drop the name of the package
             raise MachineError(remedy_of(error) or str(error)) from error
 
+        _spare_imports()
         return gym.make(
             self._row.env_id,
             num_envs=num_envs,
@@ -244,6 +248,18 @@ class ConstructSkillEnv(gym.Env):
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
         return {"is_success": bool(info["success"][0]), **booleans}
+
+
+@functools.cache
+def _spare_imports() -> None:
+    """In a worker process, keep what there is by now from the garbage collector.
+
+    ManiSkill has it look at every object whenever a scene ends, and a million imported ones took most of a reset. Any
+    other process is its user's, whose objects have to stay collectable.
+    """
+    if multiprocessing.parent_process() is not None:
+        gc.collect()
+        gc.freeze()
 
 
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:

@@ -5,6 +5,7 @@ Collision meshes are the original files, and so is the SRDF, which lists the lin
 SAPIEN looks for beside a URDF: physics does not know which robot is drawn.
 """
 
+import functools
 import hashlib
 import os
 import shutil
@@ -135,8 +136,9 @@ def textured(image: np.ndarray, roughness: float = 0.9) -> sapien.render.RenderM
     return material
 
 
+@functools.lru_cache(maxsize=32)  # every episode has its scene made anew
 def mottled(colour: tuple[int, int, int], contrast: float, size: int = 256, seed: int = 0) -> np.ndarray:
-    """A mineral surface of mean `colour`: soft blotches and fine grain, (size, size, 3) uint8.
+    """A mineral surface of mean `colour`: soft blotches and fine grain, (size, size, 3) uint8, not to be written to.
 
     Args:
         colour: mean RGB, 0 to 255.
@@ -148,7 +150,9 @@ def mottled(colour: tuple[int, int, int], contrast: float, size: int = 256, seed
         coarse = Image.fromarray(rng.standard_normal((cells, cells)).astype(np.float32))
         brightness += np.asarray(coarse.resize((size, size), Image.Resampling.BICUBIC))
     brightness *= contrast / brightness.std()
-    return np.clip(np.array(colour) * (1 + brightness[..., None]), 0, 255).astype(np.uint8)
+    surface = np.clip(np.array(colour) * (1 + brightness[..., None]), 0, 255).astype(np.uint8)
+    surface.setflags(write=False)
+    return surface
 
 
 def perforated(image: np.ndarray, rows: int, columns: int, radius: float) -> np.ndarray:

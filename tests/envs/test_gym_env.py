@@ -1,8 +1,11 @@
 """The environment as Gymnasium and LeRobot see it."""
 
+import gc
 import os
 import subprocess
 import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -258,6 +261,30 @@ def test_an_episode_does_not_remember_the_one_before_it():
     for first, second in zip(*episodes, strict=True):
         np.testing.assert_array_equal(first["sim.object_pose"], second["sim.object_pose"])
         np.testing.assert_array_equal(first["observation.images.base"], second["observation.images.base"])
+
+
+def count_after_episodes() -> tuple[int, int]:
+    """How many scenes there are after five episodes, and how many objects the garbage collector passes over."""
+    env = ConstructSkillEnv(render_backend="none")
+    for seed in range(5):
+        env.reset(seed=seed)
+        env.step(HOVER)
+    names = [type(thing).__name__ for thing in gc.get_objects()]
+    return names.count("ManiSkillScene"), gc.get_freeze_count()
+
+
+@pytest.mark.sim
+def test_a_worker_passes_over_its_imports_and_still_frees_its_scenes():
+    with ProcessPoolExecutor(1, get_context("spawn")) as worker:
+        scenes, spared = worker.submit(count_after_episodes).result()
+    assert scenes <= 2  # this one, and the last until the next reset
+    assert spared > 100_000
+
+
+@pytest.mark.sim
+def test_in_its_users_process_every_object_stays_collectable():
+    before = gc.get_freeze_count()
+    assert count_after_episodes()[1] <= before
 
 
 @pytest.mark.sim

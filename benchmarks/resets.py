@@ -1,0 +1,54 @@
+"""Resets per second of CPU time after a stepped episode, in workers as rollouts, generation and replay have them.
+
+A reset builds the scene anew, as an episode has to know nothing of the one before it. Against it: the same worker
+whose garbage collector looks at all that was imported, as ManiSkill has it do whenever a scene ends. They take turns,
+each in a process of its own, with and without rendering (one camera).
+"""
+
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+from measure import report
+
+TURNS, EPISODES = 3, 10
+OURS, ALL_OBJECTS = "ours", "the garbage collector looks at what was imported"
+
+
+def seconds_a_reset(spare_imports: bool, render_backend: str) -> float:
+    """CPU seconds of a reset and one step, in this process."""
+    import torch
+
+    from lerobot_constructskill.envs import gym_env
+
+    torch.set_num_threads(1)
+    if not spare_imports:
+        gym_env._spare_imports = lambda: None
+    env = gym_env.ConstructSkillEnv(
+        "brick_to_bin_shifted", "pixels_agent_pos", render_backend=render_backend, cameras=("wrist",)
+    )
+    hover = np.array([0, 0, 0, 1], dtype=np.float32)
+    env.reset(seed=0)
+    start = time.process_time()
+    for seed in range(EPISODES):
+        env.step(hover)
+        env.reset(seed=seed)
+    return (time.process_time() - start) / EPISODES
+
+
+def main() -> None:
+    os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    for render_backend, what in (("cpu", "rendering"), ("none", "without rendering, as in a replay")):
+        seconds = {OURS: 0.0, ALL_OBJECTS: 0.0}
+        for _ in range(TURNS):
+            for name in seconds:
+                with ProcessPoolExecutor(1, get_context("spawn")) as worker:
+                    seconds[name] += worker.submit(seconds_a_reset, name == OURS, render_backend).result() / TURNS
+        rates = {name: 1 / taken for name, taken in seconds.items()}
+        report(f"resets per second of CPU time, {what}", rates[OURS], ALL_OBJECTS, rates[ALL_OBJECTS])
+
+
+if __name__ == "__main__":
+    main()
