@@ -22,7 +22,8 @@ class Analysis:
             every pair with equally many planned seeds by default.
         alpha: level of those tests.
         sweeps: name of what is varied to the settings that differ in it, the one without it first. They stand
-            beside it in one table and one figure, in place of a section each with its comparisons.
+            beside it in one table and one figure, in place of a section each where there is one variant and so nothing
+            to compare. Variants with the same label are one line.
 
     Raises:
         InputError: no such tests can be made.
@@ -43,11 +44,6 @@ class Analysis:
             if len(settings) < 2 or len(set(settings)) < len(settings):
                 raise InputError(f"A sweep must be two settings or more, each once; '{name}' is {settings}.")
 
-    @property
-    def swept(self) -> set[str]:
-        """Settings that have no section of their own."""
-        return {name for settings in self.sweeps.values() for name in settings[1:]}
-
     def check(self, variants: Collection[str], settings: Collection[str], references: Collection[str] = ()) -> None:
         """Refuse names that the study does not have.
 
@@ -58,10 +54,11 @@ class Analysis:
         _check_known("variant in order", self.order, variants)
         _check_known("name in labels", self.labels, [*variants, *settings, *references, *self.sweeps])
         _check_known("setting in sweeps", chain.from_iterable(self.sweeps.values()), settings)
+        varied = {name for swept in self.sweeps.values() for name in swept[1:]}
         for name, swept in self.sweeps.items():
             if name in (*variants, *settings, *references):
                 raise InputError(f"The sweep '{name}' needs a name that nothing else in the study has.")
-            if swept[0] in self.swept:
+            if swept[0] in varied:
                 raise InputError(f"'{swept[0]}' begins the sweep '{name}' and must not be varied in another.")
 
     def label(self, name: str) -> str:

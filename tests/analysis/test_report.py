@@ -209,21 +209,50 @@ def test_a_sweep_has_a_name_and_a_beginning_of_its_own(sweeps, said, tmp_path):
         findings_of(STUDY, study_rows(), tmp_path, sweeps=sweeps)
 
 
-def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections(tmp_path):
-    sweeps = {"position": ["fixed", "moved"]}
-    findings = findings_of(STUDY, study_rows(), tmp_path, sweeps=sweeps)
-    assert [setting.name for setting in findings.sections] == ["fixed"]
-    assert [line.name for line in findings.swept_lines] == [*STUDY["variants"], *STUDY["references"]]
+ONE_VARIANT = STUDY | {"variants": {"dinov2": {"seeds": 10}}, "analysis": {}}
+
+
+@pytest.mark.parametrize("study, sections", [(STUDY, ["fixed", "moved"]), (ONE_VARIANT, ["fixed"])])
+def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_nothing(study, sections, tmp_path):
+    names = [*study["variants"], *study["references"]]
+    findings = findings_of(study, study_rows(study), tmp_path, sweeps={"position": ["fixed", "moved"]})
+    assert [setting.name for setting in findings.sections] == sections
+    assert [line.name for line in findings.swept_lines] == names
     drawn = {path.name for path in files(tmp_path)}
-    assert drawn >= {"sweeps.png", "fixed_seeds.png"} and "moved_seeds.png" not in drawn
+    assert drawn >= {"sweeps.png", *(f"{setting}_seeds.png" for setting in sections)}
+    assert ("moved_seeds.png" in drawn) == ("moved" in sections)
     lines = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("| position |")]
-    ran = [(s.label, line.outcomes["placed"]) for name in (*STUDY["variants"], *STUDY["references"])
+    ran = [(s.label, line.outcomes["placed"]) for name in names
            for s in findings.settings for line in s.everything if line.name == name]  # fmt: skip
-    assert len(lines) == len(ran) == 11 + 2 * len(STUDY["references"])
+    assert len(lines) == len(ran) == 2 * len(names) - ("augreg" in names)
     for line, (setting, placed) in zip(lines, ran, strict=True):
         assert f"| {setting} |" in line and f"| {10 * placed.mean.value:.1f}" in line
     page = Reader((tmp_path / "report.html").read_text())
-    assert "Along each sweep" in page.text and "#moved" not in page.links and "#sweeps" in page.links
+    assert "Along each sweep" in page.text and "#sweeps" in page.links
+    assert ("#moved" in page.links) == ("moved" in sections)
+
+
+def test_in_a_sweep_variants_with_the_same_label_are_one_line(tmp_path):
+    study = STUDY | {
+        "variants": {"clip": {"seeds": 10, "settings": ["fixed"]}, "dinov2": {"seeds": 10, "settings": ["moved"]}}
+    }
+    labels = {"clip": "Either", "dinov2": "Either"}
+    findings = findings_of(
+        study,
+        study_rows(study),
+        tmp_path,
+        sweeps={"position": ["fixed", "moved"]},
+        labels=labels,
+        order=[],
+        comparisons=[],
+    )
+    either = [line.label for line in findings.swept_lines].count("Either")
+    assert either == 1
+    (sweep,) = findings.sweeps
+    assert [(setting.name, line.name) for setting, line in sweep.lines("Either")] == [
+        ("fixed", "clip"),
+        ("moved", "dinov2"),
+    ]
 
 
 @pytest.mark.parametrize(

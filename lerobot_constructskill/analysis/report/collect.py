@@ -50,7 +50,6 @@ def collect(analysis: Analysis, rows: pd.DataFrame) -> Findings:
     missing = planned["error_kind"].fillna("") == NOT_RUN
     return Findings(
         settings=settings,
-        swept=analysis.swept,
         sweeps=[
             Sweep(analysis.label(name), [by_name[setting] for setting in swept])
             for name, swept in analysis.sweeps.items()

@@ -173,8 +173,8 @@ def sweep_figure(findings: Findings) -> Drawing:
         return figure
 
     caption = (
-        "Episodes that were placed, along what is varied. Thin: one training seed each; thick: their mean. At "
-        "the left of each panel what it is compared with."
+        "Episodes that were placed, along what is varied, from the left. Thin: one training seed each; thick: their "
+        "mean."
     )
     return Drawing("sweeps", caption, draw)
 
@@ -211,7 +211,7 @@ def detectable_figure(findings: Findings) -> Drawing:
 
 def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str) -> None:
     """Each seed of a variant or reference, and their mean, over the sweep's settings; where nothing ran is a gap."""
-    ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in sweep.lines(of.name)
+    ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in sweep.lines(of.label)
            if line.outcomes}  # fmt: skip
     if not ran:
         return

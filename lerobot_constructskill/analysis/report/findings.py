@@ -174,9 +174,9 @@ class Sweep:
     label: str
     settings: list[SettingFindings]
 
-    def lines(self, name: str) -> list[tuple[SettingFindings, Line]]:
-        """A variant or a reference in each setting where it runs."""
-        return [(setting, line) for setting in self.settings for line in setting.everything if line.name == name]
+    def lines(self, label: str) -> list[tuple[SettingFindings, Line]]:
+        """What is called so, a variant or a reference, in each setting where it runs."""
+        return [(setting, line) for setting in self.settings for line in setting.everything if line.label == label]
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,6 @@ class Findings:
 
     Args:
         settings: what each setting shows.
-        swept: names of those that are shown by their sweeps alone.
         sweeps: what comes of varying one thing at a time.
         alpha: level of its tests.
         episodes: evaluation episodes of a run.
@@ -198,7 +197,6 @@ class Findings:
     """
 
     settings: list[SettingFindings]
-    swept: set[str]
     sweeps: list[Sweep]
     alpha: float
     episodes: int
@@ -211,16 +209,17 @@ class Findings:
 
     @property
     def sections(self) -> list[SettingFindings]:
-        """The settings with a section of their own."""
-        return [setting for setting in self.settings if setting.name not in self.swept]
+        """The settings with a section of their own: what a sweep goes on to has one where it compares variants."""
+        swept = {setting.name for sweep in self.sweeps for setting in sweep.settings[1:]}
+        return [setting for setting in self.settings if setting.name not in swept or len(setting.lines) > 1]
 
     @property
     def swept_lines(self) -> list[Line]:
-        """The variants, and then the references, that run in sweeps: a line of each."""
+        """The variants, and then the references, that run in sweeps: a line of each label."""
         settings = list(chain.from_iterable(sweep.settings for sweep in self.sweeps))
         lines: dict[str, Line] = {}
         for line in chain(*(setting.lines for setting in settings), *(setting.references for setting in settings)):
-            lines.setdefault(line.name, line)
+            lines.setdefault(line.label, line)
         return list(lines.values())
 
     @property
