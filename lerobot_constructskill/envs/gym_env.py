@@ -133,7 +133,7 @@ class ConstructSkillEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
-        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.2 s.
+        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
         self._steps = 0
         self._pixel_rngs = {
