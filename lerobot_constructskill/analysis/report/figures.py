@@ -14,6 +14,7 @@ from lerobot_constructskill.analysis.report.ink import MARKERS, Drawing, Ink, pa
 from lerobot_constructskill.analysis.stats.comparisons import Comparison
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA
 from lerobot_constructskill.analysis.stats.power import detectable_difference, wrong_order
+from lerobot_constructskill.study.rows import VARIANT
 
 SEEDS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 30, 40, 50)
 """Numbers of seeds on the axes of planning curves."""
@@ -148,7 +149,7 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
 
 
 def sweep_figure(findings: Findings) -> Drawing:
-    """Episodes placed along each sweep: a thin line a seed, a thick one their mean."""
+    """Episodes placed along each sweep: a thin line a seed, a thick one their mean; references in broken grey."""
     sweeps, columns = findings.sweeps, min(4, len(findings.sweeps))
     lines = findings.swept_lines
 
@@ -157,7 +158,9 @@ def sweep_figure(findings: Findings) -> Drawing:
         figure, axes = panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
         for axis, sweep in zip(axes, sweeps, strict=False):
             for i, line in enumerate(lines):
-                _along(axis, sweep, line, ink.series[i % len(ink.series)], MARKERS[i % len(MARKERS)])
+                reference = line.role != VARIANT
+                colour = ink.muted if reference else ink.series[i % len(ink.series)]
+                _along(axis, sweep, line, colour, MARKERS[i % len(MARKERS)], "--" if reference else "-")
             names = [fill(setting.label, 10, break_long_words=False) for setting in sweep.settings]
             axis.set_xticks(range(len(names)), names, fontsize=7.5)
             axis.set(title=sweep.label, xlim=(-0.3, len(names) - 0.7))
@@ -209,17 +212,20 @@ def detectable_figure(findings: Findings) -> Drawing:
     return Drawing("detectable_difference", caption, draw)
 
 
-def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str) -> None:
-    """Each seed of a variant or reference, and their mean, over the sweep's settings; where nothing ran is a gap."""
-    ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in sweep.lines(of.label)
-           if line.outcomes}  # fmt: skip
-    if not ran:
+def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str, style: str) -> None:
+    """Each seed of a variant or reference, and their mean, over the sweep's settings; where nothing ran is a gap.
+
+    What the study has in one setting alone is no line, and stands in the table.
+    """
+    lines = sweep.lines(of.label)
+    ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in lines if line.outcomes}
+    if not ran or len(lines) < 2:
         return
     seeds = pd.DataFrame(ran).reindex(columns=[setting.name for setting in sweep.settings])
     places = range(len(sweep.settings))
     for _, placed in seeds.iterrows():
-        axis.plot(places, placed, color=colour, linewidth=0.7, alpha=0.35)
-    axis.plot(places, seeds.mean(), marker=marker, color=colour, markersize=5, label=_wrap(of.label))
+        axis.plot(places, placed, style, color=colour, linewidth=0.7, alpha=0.35)
+    axis.plot(places, seeds.mean(), style, marker=marker, color=colour, markersize=5, label=_wrap(of.label))
 
 
 def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:
