@@ -149,7 +149,7 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
 
 
 def sweep_figure(findings: Findings) -> Drawing:
-    """Episodes placed along each sweep: a thin line a seed, a thick one their mean; references in broken grey."""
+    """Episodes placed along each sweep: a faint line a seed, a strong one their mean; references in broken grey."""
     sweeps, columns = findings.sweeps, min(4, len(findings.sweeps))
     lines = findings.swept_lines
 
@@ -158,9 +158,8 @@ def sweep_figure(findings: Findings) -> Drawing:
         figure, axes = panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
         for axis, sweep in zip(axes, sweeps, strict=False):
             for i, line in enumerate(lines):
-                reference = line.role != VARIANT
-                colour = ink.muted if reference else ink.series[i % len(ink.series)]
-                _along(axis, sweep, line, colour, MARKERS[i % len(MARKERS)], "--" if reference else "-")
+                colour = ink.series[i % len(ink.series)] if line.role == VARIANT else ink.muted
+                _along(axis, sweep, line, colour, MARKERS[i % len(MARKERS)])
             names = [fill(setting.label, 10, break_long_words=False) for setting in sweep.settings]
             axis.set_xticks(range(len(names)), names, fontsize=7.5)
             axis.set(title=sweep.label, xlim=(-0.3, len(names) - 0.7))
@@ -170,13 +169,13 @@ def sweep_figure(findings: Findings) -> Drawing:
             axis.set_axis_off()
         for axis in axes[::columns]:
             axis.set_ylabel(f"placed of {findings.episodes}")
-        axes[0].set_ylim(-0.04 * findings.episodes, 1.04 * findings.episodes)
+        axes[0].set_ylim(-0.06 * findings.episodes, 1.06 * findings.episodes)
         handles = {label: line for axis in axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=8)
         return figure
 
     caption = (
-        "Episodes that were placed, along what is varied, from the left. Thin: one training seed each; thick: their "
+        "Episodes that were placed, along what is varied, from the left. Faint: one training seed each; strong: their "
         "mean."
     )
     return Drawing("sweeps", caption, draw)
@@ -212,10 +211,11 @@ def detectable_figure(findings: Findings) -> Drawing:
     return Drawing("detectable_difference", caption, draw)
 
 
-def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str, style: str) -> None:
+def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str) -> None:
     """Each seed of a variant or reference, and their mean, over the sweep's settings; where nothing ran is a gap.
 
-    What the study has in one setting alone is no line, and stands in the table.
+    What the study has in one setting alone is no line, and stands in the table. A reference's markers are hollow: what
+    reaches it is seen inside.
     """
     lines = sweep.lines(of.label)
     ran = {setting.name: line.runs.set_index("training_seed")["placed"] for setting, line in lines if line.outcomes}
@@ -223,9 +223,12 @@ def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str, style: 
         return
     seeds = pd.DataFrame(ran).reindex(columns=[setting.name for setting in sweep.settings])
     places = range(len(sweep.settings))
+    form = {"linestyle": "-", "markersize": 5}
+    if of.role != VARIANT:
+        form = {"linestyle": "--", "markersize": 8, "markerfacecolor": "none"}
     for _, placed in seeds.iterrows():
-        axis.plot(places, placed, style, color=colour, linewidth=0.7, alpha=0.35)
-    axis.plot(places, seeds.mean(), style, marker=marker, color=colour, markersize=5, label=_wrap(of.label))
+        axis.plot(places, placed, form["linestyle"], marker=".", color=colour, linewidth=0.7, markersize=4, alpha=0.35)
+    axis.plot(places, seeds.mean(), marker=marker, color=colour, label=_wrap(of.label), **form)
 
 
 def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:
