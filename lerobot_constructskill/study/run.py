@@ -56,7 +56,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
                 _write_provenance(root, earlier + time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
-        validate(chosen, store, options.workers)
+        validate(chosen, [run for run in runs if run not in chosen], store, options.workers)
         table.write_anew()
         return table
 

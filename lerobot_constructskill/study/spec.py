@@ -133,7 +133,7 @@ class Options:
 
     Args:
         only: make only the runs setting/variant/seed_N that match, such as `fixed` or `fixed/*/seed_[0-4]`; several
-            separated by commas.
+            separated by commas. They are not validated on demonstrations of others.
         together: seeds that are trained and evaluated in one pass.
         executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
             store on a file system that all its machines share).

@@ -17,10 +17,14 @@ FILE = "heldout.json"
 logger = logging.getLogger(__name__)
 
 
-def validate(runs: Sequence[Run], store: Store, workers: int = 1) -> None:
-    """Measure whatever has not been measured; what cannot be is logged and stays unknown."""
-    arms = {id(run.arm): run.arm for run in runs if run.arm.policy and trainer_of(run.arm.policy).heldout_mse}
-    pairs = [(arm, data) for arm in arms.values() for data in arm.validated_on if data != arm.demonstrations]
+def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, workers: int = 1) -> None:
+    """Measure whatever has not been measured; what cannot be is logged and stays unknown.
+
+    Args:
+        runs: those whose policies are validated.
+        others: the other runs of their study, which are not asked for.
+    """
+    pairs = list_pairs(runs, others)
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         own = [run for run in runs if run.arm is arm and store.has(run.checkpoint)]
         missing = [run for run in own if not store.has(run.heldout(data))]
@@ -30,6 +34,20 @@ def validate(runs: Sequence[Run], store: Store, workers: int = 1) -> None:
         except Exception as error:
             logger.warning("%s/%s is not validated on %s: %s", arm.setting, arm.name, data.name, error)
             store.note(missing[0].heldout(data), error)
+
+
+def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, Demonstrations]]:
+    """What is validated, and on which other set of its setting: none that would be made for `others` alone."""
+    arms = {id(run.arm): run.arm for run in runs}.values()
+    own = [arm.demonstrations for arm in arms]
+    spared = [run.arm.demonstrations for run in others if run.arm.demonstrations not in own]
+    return [
+        (arm, data)
+        for arm in arms
+        if arm.policy and trainer_of(arm.policy).heldout_mse
+        for data in arm.validated_on
+        if data != arm.demonstrations and data not in spared
+    ]
 
 
 def read_error(run: Run, data: Demonstrations, store: Store) -> float | None:

@@ -17,6 +17,7 @@ from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
+from lerobot_constructskill.study.validate import list_pairs
 from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
@@ -62,6 +63,29 @@ def test_thirty_seeds_after_ten_are_twenty_runs():
     assert changed(ten, thirty) == {f"fixed/a/seed_{seed}" for seed in range(10, 30)}
     elsewhere = study(variants={"a": Variant(ACT, seeds=2, first_seed=100)})
     assert changed(ten, elsewhere) == {"fixed/a/seed_100", "fixed/a/seed_101"}
+
+
+def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
+    frozen_vit = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    own, more, most = "smoke", "smoke --episodes=4", "smoke --episodes=8"
+    settings = {"fixed": Setting("smoke", {"episode_length": 8}), "alone": Setting("fast", {"episode_length": 8})}
+    variants = {
+        "own": Variant(frozen_vit, seeds=2, settings=["fixed"]),
+        "more": Variant(frozen_vit, seeds=2, data="--episodes=4", settings=["fixed"]),
+        "most": Variant(frozen_vit, seeds=2, data="--episodes=8"),
+    }
+    runs = list_runs(study(settings=settings, variants=variants))
+
+    def validated(only: str) -> set[tuple[str, str, str]]:
+        chosen = choose(runs, only)
+        pairs = list_pairs(chosen, [run for run in runs if run not in chosen])
+        return {(arm.setting, arm.name, data.name) for arm, data in pairs}
+
+    fixed = {("fixed", "own", more), ("fixed", "own", most), ("fixed", "more", own), ("fixed", "more", most)}
+    alone = {("alone", "most", "fast")}  # a set that no variant learns from
+    assert validated("") == fixed | {("fixed", "most", own), ("fixed", "most", more)} | alone
+    assert validated("fixed/most/seed_0") == set() and validated("alone") == alone
+    assert validated("fixed/own/seed_1,fixed/more") == {("fixed", "own", more), ("fixed", "more", own)}
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
