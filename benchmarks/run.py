@@ -19,6 +19,7 @@ from pathlib import Path
 
 from measure import BIN, OUT, run
 
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, native_precision
 
 HERE = Path(__file__).parent
@@ -49,12 +50,10 @@ def measure(name: str) -> list[dict]:
 
 def machine() -> str:
     """The machine, what caps its instructions and the versions, in a sentence."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    cpu = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     cap = f" under ONEDNN_MAX_CPU_ISA={os.environ[ISA_CAP]}" if os.environ.get(ISA_CAP) else ""
     cores = subprocess.run(["nproc"], capture_output=True, text=True).stdout.strip()
     versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES)
-    kind = f"{cores} cores of an {cpu} ({native_precision()} native){cap}, {platform.system()}, no GPU used"
+    kind = f"{cores} cores of an {processor()} ({native_precision()} native){cap}, {platform.system()}, no GPU used"
     return f"{date.today()}, {kind}; {versions}."
 
 

@@ -67,6 +67,10 @@ class Store:
             raise InputError(f"{folder} was not made by this version of the package: move it away.")
         return True
 
+    def keeps(self, kind: str, name: str) -> bool:
+        """Whether something of this digest has been made, whatever its specification."""
+        return (self.root / kind / name).is_dir()
+
     @contextmanager
     def claim(self, artifacts: Sequence[Artifact]) -> Iterator[list[Artifact]]:
         """Wait until nobody else makes any of `artifacts`, and yield those that are still to be made."""

@@ -1,6 +1,7 @@
 """The board's entries: submissions, what is known of each, and what their seeds reached in every setting."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -102,22 +103,27 @@ def _entry(root: Path, path: Path) -> Entry:
     if not NAME.allows(path.name):
         raise InputError(f"The folder of an entry must be called by {NAME.meaning}, not {path.name!a}.")
     submission = read_submission(path)
-    verdict = _verdict(root / VERIFIED / f"{path.name}.json", submission)
+    verdict = read_verdict(root / VERIFIED / f"{path.name}.json", {"submission": submission.sha256})
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
 
 
-def _verdict(path: Path, submission: Submission) -> dict[str, Any]:
-    """What was found, if it was found of this very submission."""
+def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
+    """What was found and recorded in a file, if it says what `of` says; empty otherwise.
+
+    Raises:
+        InputError: the file is no verdict.
+    """
     if not path.is_file():
         return {}
     try:
-        verdict = json.loads(path.read_text())
+        verdict = {"machines": []} | json.loads(path.read_text())  # before 2026-11-24 none was named
         known = verdict["level"] in LEVELS and isinstance(verdict["versions"], dict)
+        known = known and isinstance(verdict["machines"], list)
     except (ValueError, KeyError, TypeError):
         known = False
     if not known:
         raise InputError(f"'{path}' is not a verdict of constructskill-verify.")
-    return verdict if verdict.get("submission") == submission.sha256 else {}
+    return verdict if all(verdict.get(name) == value for name, value in of.items()) else {}
 
 
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
@@ -17,7 +18,7 @@ from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import close_patches, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
-from lerobot_constructskill.policies.frozen_vit.precision import resolve_precision
+from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
@@ -39,6 +40,12 @@ class FeatureTrainer:
         spec = get_backbone(config.backbone, config.backbone_path)
         sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
+
+    def settled_elsewhere(self, config: FrozenViTChunkConfig) -> list[dict[str, Any]]:
+        """The precisions that `auto` means on other machines."""
+        here = resolve_precision(config.backbone_precision, config.device)
+        others = PRECISIONS if config.backbone_precision == AUTO else ()
+        return [{"backbone_precision": one} for one in others if one != here]
 
     @contextmanager
     def joined(

@@ -58,6 +58,17 @@ def verify(config: VerifyConfig) -> str:
     return told
 
 
+def _record(path: Path, facts: dict) -> None:
+    """Write what was found; the machines that found the same before stay named."""
+    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.artifacts.processor import processor
+    from lerobot_constructskill.board.entries import read_verdict
+
+    machines = dict.fromkeys([*read_verdict(path, facts).get("machines", []), processor()])
+    with replaced(path) as partial:
+        partial.write_text(json.dumps(facts | {"machines": list(machines)}, indent=2) + "\n")
+
+
 def _replayed(submission, config: VerifyConfig):
     from lerobot_constructskill.board.replay import replay
 
@@ -86,13 +97,6 @@ def _rerun(submission, config: VerifyConfig):
     _replayed(again, config)
     comparison.confirm()
     return comparison
-
-
-def _record(path: Path, facts: dict) -> None:
-    from lerobot_constructskill.artifacts.folders import replaced
-
-    with replaced(path) as partial:
-        partial.write_text(json.dumps(facts, indent=2) + "\n")
 
 
 def main() -> None:

@@ -2,18 +2,19 @@
 
 import json
 import os
-import platform
 import time
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from itertools import batched, groupby
 from pathlib import Path
+from typing import Any
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.artifacts.pools import open_pool
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.execute import Job, make_runs
 from lerobot_constructskill.study.rows import PROVENANCE, STUDY
@@ -42,6 +43,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         with replaced(root / STUDY) as partial:
             partial.write_text(text)
         table = Table(root, runs, store)
+        _check_nothing_is_lost(table)
         for run in table.failed() if options.retry_failed else []:
             if run in chosen:
                 table.forget_failure(run)
@@ -49,16 +51,25 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         with store.claim([run.artifact for run in chosen if run not in missing]):
             pass  # which tidies up after a process that was killed when one of them was whole
         table.write()
-        earlier, start = _wall_time(root), time.monotonic()
+        earlier, start = _provenance(root), time.monotonic()
         with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:
             for run in _execute(_jobs(missing, root, store, options), options):
                 table.write()
-                _write_provenance(root, earlier + time.monotonic() - start)
+                _write_provenance(root, earlier, time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
         validate(chosen, [run for run in runs if run not in chosen], store, options.workers)
         table.write_anew()
         return table
+
+
+def _check_nothing_is_lost(table: Table) -> None:
+    if lost := table.lost():
+        raise InputError(
+            f"{table.root} has rows of {plural(len(lost), 'run')}, such as {lost[0]}, that are not of this study as "
+            f"it is, or of other versions of packages, and {table.store.root} does not keep them: they would be lost. "
+            "Give another --root, or move the folder away."
+        )
 
 
 def choose(runs: Sequence[Run], only: str) -> list[Run]:
@@ -96,22 +107,20 @@ def _make_all(job: Job) -> list[Run]:
     return list(make_runs(job))
 
 
-def _processor() -> str:
-    """The processor's name, which Linux keeps where Python does not look."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
-
-
-def _wall_time(root: Path) -> float:
-    """Seconds that earlier sessions of the study took, up to the last run that each finished."""
+def _provenance(root: Path) -> dict[str, Any]:
+    """What earlier sessions of the study said, each up to the last run that it finished."""
     path = root / PROVENANCE
-    return json.loads(path.read_text()).get("wall time, s", 0) if path.exists() else 0
+    return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _write_provenance(root: Path, seconds: float) -> None:
-    """Say where the study ran, and for how long in all."""
+def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> None:
+    """Say where the study ran, on every machine, and for how long in all."""
     stages = {f"of which {stage}, s": round(total) for stage, total in seconds_by_stage(root).items()}
-    facts = {"wall time, s": round(seconds), **stages, "machine": f"{os.cpu_count()} cores, {_processor()}"}
+    machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
+    facts = {
+        "wall time, s": round(earlier.get("wall time, s", 0) + seconds),
+        **stages,
+        "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
+    }
     with replaced(root / PROVENANCE) as partial:
         partial.write_text(json.dumps(facts, indent=2) + "\n")

@@ -22,7 +22,13 @@ from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import Study, Variant
-from lerobot_constructskill.training.checkpoints import LEARNING, checkpoint_artifact, decode_policy, settle_policy
+from lerobot_constructskill.training.checkpoints import (
+    LEARNING,
+    checkpoint_artifact,
+    decode_policy,
+    settle_policy,
+    settled_elsewhere,
+)
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import packages_of
 
@@ -55,6 +61,7 @@ class Arm:
         policy: settled configuration of what is trained; None for references that are not.
         training: how.
         dagger: whose rounds it is trained on beside the demonstrations, if it is.
+        elsewhere: the same as machines of another kind would settle its policy.
     """
 
     setting: str
@@ -67,6 +74,7 @@ class Arm:
     policy: PreTrainedConfig | None = None
     training: Training | None = None
     dagger: DaggerConfig | None = None
+    elsewhere: tuple["Arm", ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +112,11 @@ class Run:
             agent["demonstrations"] = arm.demonstrations.artifact.spec
         facts = {"environment": arm.env, "evaluation": arm.evaluation, "versions": self.versions}
         return Artifact("runs", agent | facts)
+
+    @cached_property
+    def digests(self) -> tuple[str, ...]:
+        """That of its episodes, and those that they have where machines of another kind made them."""
+        return tuple(Run(arm, self.seed).artifact.digest for arm in (self.arm, *self.arm.elsewhere))
 
     @cached_property
     def versions(self) -> dict[str, str]:
@@ -145,12 +158,14 @@ def list_runs(study: Study) -> list[Run]:
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
         policy = settle_policy(variant.policy)
+        others = settled_elsewhere(variant.policy)
     training = _training_of(study, common["setting"], name, variant)
     learnt = {"demonstrations": data, "policy": policy, "training": training}
     if variant.dagger:
         rounds = _dagger_config(variant)
         learnt["dagger"] = replace(rounds, base=data.name, policy=variant.policy, training=training)
-    return Arm(name=name, role=VARIANT, **learnt, **common)
+    elsewhere = (_variant_arm(study, name, replace(variant, policy=other), data, common) for other in others)
+    return Arm(name=name, role=VARIANT, elsewhere=tuple(elsewhere), **learnt, **common)
 
 
 def _dagger_config(variant: Variant) -> DaggerConfig:
@@ -166,10 +181,11 @@ def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mappin
     if reference.policy:
         base, variant = _variant_with(study, name, reference)
         with _inside(f"references.{name}"):
-            policy = settle_policy({**variant.policy, **reference.policy})
-        return replace(
-            arm, demonstrations=data, policy=policy, training=_training_of(study, common["setting"], base, variant)
-        )
+            fields = {**variant.policy, **reference.policy}
+            policies = [settle_policy(one) for one in (fields, *settled_elsewhere(fields))]
+        training = _training_of(study, common["setting"], base, variant)
+        here, *elsewhere = [replace(arm, demonstrations=data, policy=one, training=training) for one in policies]
+        return replace(here, elsewhere=tuple(elsewhere))
     return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
 
 

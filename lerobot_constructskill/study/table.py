@@ -1,7 +1,7 @@
 """What there is of a study: its runs as one table of rows, its videos, and what is missing or failed, and why.
 
 A run counts as made where the store has it, and also where the table in the study's folder has its rows already: so
-anyone who has the folder of a published study can continue it, without its checkpoints.
+anyone who has the folder of a published study can continue it, without its checkpoints and on another kind of machine.
 """
 
 import json
@@ -58,7 +58,18 @@ class Table:
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
-        return self._made.get(name) or self._kept.get((run.arm.setting, run.arm.name, name))
+        return self._made.get(name) or next((rows for key in _keys(run) if (rows := self._kept.get(key))), None)
+
+    def lost(self) -> list[str]:
+        """The finished runs of the table in the folder that neither this study nor the store has."""
+        ours = {key for run in self.runs for key in _keys(run)}
+        gone = [
+            row
+            for key, rows in self._kept.items()
+            if key not in ours and not (key[-1] and self.store.keeps("runs", key[-1]))
+            for row in rows
+        ]
+        return list(dict.fromkeys(f"{row.setting}/{row.variant}/seed_{row.training_seed}" for row in gone))
 
     def forget_failure(self, run: Run) -> None:
         """Discard a run that failed, so that it is made anew, unless somebody has done so."""
@@ -126,6 +137,11 @@ def _finished(file: Path) -> dict[tuple[str, str, str | None], list[Row]]:
     rows = [row for row in load_rows(file, Row) if not row.error_kind] if file.exists() else []
     by_run = groupby(rows, key=lambda row: (row.setting, row.variant, row.run))
     return {key: list(episodes) for key, episodes in by_run}
+
+
+def _keys(run: Run) -> list[tuple[str, str, str]]:
+    """What the rows of a run may be found by in `_finished`."""
+    return [(run.arm.setting, run.arm.name, name) for name in run.digests]
 
 
 def _names(run: Run) -> dict[str, Any]:

@@ -34,6 +34,12 @@ def settle_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
     return trainer_of(config).settle(config)
 
 
+def settled_elsewhere(fields: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The same fields for each other kind of machine, with that written out which it would settle otherwise."""
+    config = decode_policy(fields)
+    return [{**fields, **others} for others in trainer_of(config).settled_elsewhere(config)]
+
+
 def checkpoint_artifact(
     policy: PreTrainedConfig, training: Training, seed: int, demonstrations: Mapping[str, Any]
 ) -> Artifact:

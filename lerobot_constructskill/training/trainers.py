@@ -49,6 +49,10 @@ class Trainer:
         """Return the configuration with everything written out that it leaves to the machine."""
         return config
 
+    def settled_elsewhere(self, config: PreTrainedConfig) -> list[dict[str, Any]]:
+        """The fields that machines of another kind would write out otherwise: one dictionary for each kind."""
+        return []
+
     @contextmanager
     def joined(
         self, config: PreTrainedConfig, whole: LeRobotDataset, parts: Sequence[LeRobotDataset], store: Store

@@ -1,5 +1,6 @@
 """The commands as a stranger uses them: record, submit, verify, and from fresh starts again."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import yaml
 from commands import call
 from torchcodec.decoders import VideoDecoder
 
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.board.protocol import FIRST_FRESH
 from lerobot_constructskill.board.submission import EPISODES
 
@@ -60,7 +62,13 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     rerun = ["--value=beef", f"--rerun={again}", f"--record={tmp_path / 'verified'}"]
     said = call("constructskill-verify", f"--root={entry}", *rerun)
     assert "4 of 4 episodes replayed (12 steps)" in said and "shifted 0% submitted, 0% run anew" in said
-    assert '"level": "re-run"' in (tmp_path / "verified" / "entry.json").read_text()
+    path = tmp_path / "verified" / "entry.json"
+    verdict = json.loads(path.read_text())
+    assert verdict["level"] == "re-run" and verdict["machines"] == [processor()]
+    for sha256, machines in ((verdict["submission"], ["another", processor()]), ("", [processor()])):
+        path.write_text(json.dumps(verdict | {"submission": sha256, "machines": ["another"]}))
+        call("constructskill-verify", f"--root={entry}", *rerun)
+        assert json.loads(path.read_text())["machines"] == machines, "those that found the same of the same"
     said = call("constructskill-verify", f"--root={entry}", *rerun[1:], "--value=cafe", fails=True)
     assert "'cafe' calls for the starts from" in said and "the re-run has others" in said
 

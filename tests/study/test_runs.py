@@ -10,6 +10,8 @@ import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.policies.frozen_vit import precision
+from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.execute import EPISODES
 from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
@@ -229,6 +231,35 @@ def test_whoever_has_the_folder_of_a_study_goes_on_with_it_without_its_runs(tmp_
     assert len(Table(tmp_path / "x", other, empty).missing()) == len(other)
     run_study(study(), "", tmp_path / "x", empty, Options())  # nothing to run: neither data nor weights exist here
     pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
+
+
+def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
+    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    driven = Variant(policy, seeds=1, dagger="smoke")
+    of = study(variants={"a": Variant(policy, seeds=2), "driven": driven}, references={"blind": 1, "no_op": 1})
+    asked = study(variants={"a": Variant(policy | {"backbone_precision": "float32"}, seeds=2)}, references={})
+    for here in PRECISIONS:
+        monkeypatch.setattr(precision, "native_precision", lambda device="cpu", here=here: here)
+        runs = {run.id: run.digests for run in list_runs(of)}
+        assert {name: len(set(own)) for name, own in runs.items() if len(own) > 1} == {
+            f"fixed/{name}": 2 for name in ("blind/seed_0", "a/seed_0", "a/seed_1", "driven/seed_0")
+        }
+        assert [len(run.digests) for run in list_runs(asked)] == [1, 1], "what is asked for is not left to the machine"
+        if here == PRECISIONS[0]:
+            make_all(of, tmp_path)
+        table = Table(tmp_path / "x", list_runs(of), Store(tmp_path / "elsewhere"))
+        assert not table.missing() and not table.lost()
+
+
+def test_no_row_is_lost_that_is_nowhere_else(tmp_path):
+    table = make_all(study(), tmp_path)
+    fewer, empty = study(variants={"a": study().variants["a"]}), Store(tmp_path / "elsewhere")
+    published = read_rows(tmp_path / "x" / "rows.parquet")
+    with pytest.raises(InputError, match=r"rows of 2 runs, such as fixed/b/seed_0.* would be lost"):
+        run_study(fewer, "", tmp_path / "x", empty, Options())
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
+    run_study(fewer, "", tmp_path / "x", table.store, Options())
+    assert set(read_rows(tmp_path / "x" / "rows.parquet")["variant"]) == {"a", "no_op", "replay"}
 
 
 def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
