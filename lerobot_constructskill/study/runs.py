@@ -1,6 +1,6 @@
 """From a study to its runs: all that a run depends on is read, checked and written out before anything runs."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -21,7 +21,7 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
-from lerobot_constructskill.study.spec import Study, Variant
+from lerobot_constructskill.study.spec import SHARED, Study, Variant
 from lerobot_constructskill.training.checkpoints import (
     LEARNING,
     checkpoint_artifact,
@@ -36,16 +36,42 @@ ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
 
 
+SEEDS_APART = 2_000
+"""From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
+
+
 @dataclass(frozen=True)
 class Demonstrations:
-    """A data set that a study names: what it is called, and what it is generated from."""
+    """A data set that a study names.
+
+    Args:
+        name: what it is called.
+        config: what it is generated from.
+        moved: by how much its attempts' seeds are moved: 0 but for a training seed's own draw.
+    """
 
     name: str
     config: GenerateConfig
+    moved: int = 0
 
     @cached_property
     def artifact(self) -> Artifact:
         return artifact(self.config)
+
+    def drawn_for(self, seed: int) -> "Demonstrations":
+        """A training seed's own draw of it; that of seed 0 is what all seeds would share.
+
+        Raises:
+            InputError: two of them could have attempts in common.
+        """
+        attempts = self.config.episodes * (1 + self.config.max_failures)
+        if attempts > SEEDS_APART:
+            raise InputError(
+                f"{self.name} may take {attempts:,.0f} attempts; of demonstrations that each training seed has of its "
+                f"own, none may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
+            )
+        moved = seed * SEEDS_APART
+        return replace(self, config=replace(self.config, seed_start=self.config.seed_start + moved), moved=moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,16 +169,29 @@ def list_runs(study: Study) -> list[Run]:
             env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
         evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
-        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
-        own = sets[setting.data]
-        for reference, seeds in study.references.items():
-            arm = _reference_arm(study, reference, own, common)
-            runs += [Run(arm, seed) for seed in range(seeds)]
+        common = {"setting": name, "env": env, "evaluation": evaluation}
+        for reference, count in study.references.items():
+            for seeds, drawn in _draws(study, range(count), sets):
+                of_these = common | {"validated_on": tuple(drawn.values())}
+                arm = _reference_arm(study, reference, drawn[setting.data], of_these)
+                runs += [Run(arm, seed) for seed in seeds]
         for variant_name, variant in study.variants_in(name).items():
-            data = sets[study.data_for(name, variant)]
-            arm = _variant_arm(study, variant_name, variant, data, common)
-            runs += [Run(arm, seed) for seed in variant.training_seeds]
+            for seeds, drawn in _draws(study, variant.training_seeds, sets):
+                of_these = common | {"validated_on": tuple(drawn.values())}
+                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], of_these)
+                runs += [Run(arm, seed) for seed in seeds]
     return runs
+
+
+def _draws(
+    study: Study, seeds: range, sets: dict[str, Demonstrations]
+) -> Iterator[tuple[Sequence[int], dict[str, Demonstrations]]]:
+    """Training seeds, and the demonstrations of a setting that they all learn from."""
+    if study.demonstrations == SHARED:
+        yield seeds, sets
+        return
+    for seed in seeds:
+        yield [seed], {name: one.drawn_for(seed) for name, one in sets.items()}
 
 
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
@@ -163,7 +202,9 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
     learnt = {"demonstrations": data, "policy": policy, "training": training}
     if variant.dagger:
         rounds = _dagger_config(variant)
-        learnt["dagger"] = replace(rounds, base=data.name, policy=variant.policy, training=training)
+        base = f"{data.name} --seed_start={data.config.seed_start}" if data.moved else data.name
+        start = rounds.seed_start + data.moved
+        learnt["dagger"] = replace(rounds, base=base, seed_start=start, policy=variant.policy, training=training)
     elsewhere = (_variant_arm(study, name, replace(variant, policy=other), data, common) for other in others)
     return Arm(name=name, role=VARIANT, elsewhere=tuple(elsewhere), **learnt, **common)
 

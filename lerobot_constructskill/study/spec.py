@@ -12,6 +12,9 @@ from lerobot_constructskill.training.recipe import Training
 NAME = r"[a-z0-9][a-z0-9_-]*"
 """What studies, settings and variants are called: they name folders and videos, and stand in every row."""
 
+SHARED, OWN = "shared", "own"
+"""Whether all training seeds learn from the same demonstrations, or each from its own."""
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -69,6 +72,9 @@ class Study:
         variants: name to variant.
         references: floors and ceilings to run in every setting, to the number of their seeds.
         training: the recipe.
+        demonstrations: `shared`: the training seeds of a variant learn from the same data set, and differ in the
+            initial weights and the order of the frames. `own`: each learns from a draw of its own, so that they differ
+            in their demonstrations (and in the starts of DAgger's rounds) as well.
         episodes: evaluation episodes of a run.
         eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
 
@@ -81,6 +87,7 @@ class Study:
     variants: dict[str, Variant]
     references: dict[str, int] = field(default_factory=dict)
     training: Training = field(default_factory=Training)
+    demonstrations: Annotated[str, Among((SHARED, OWN))] = SHARED
     episodes: Count = 10
     eval_seed: Seed = 1000
 

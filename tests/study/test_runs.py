@@ -16,7 +16,7 @@ from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.execute import EPISODES
 from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
-from lerobot_constructskill.study.runs import list_runs
+from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
 from lerobot_constructskill.study.validate import list_pairs
@@ -88,6 +88,34 @@ def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
     assert validated("") == fixed | {("fixed", "most", own), ("fixed", "most", more)} | alone
     assert validated("fixed/most/seed_0") == set() and validated("alone") == alone
     assert validated("fixed/own/seed_1,fixed/more") == {("fixed", "own", more), ("fixed", "more", own)}
+
+
+def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
+    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    variants = {
+        "a": Variant(policy, seeds=3),
+        "clean": Variant(policy, seeds=3, data="--noise.sigma=0"),
+        "driven": Variant(policy, seeds=3, dagger="smoke"),
+    }
+    shared = study(variants=variants, references={"replay": 2})
+    own = study(variants=variants, references={"replay": 2}, demonstrations="own")
+    assert changed(shared, own) == {run for run in digests(own) if not run.endswith("seed_0")}
+    runs = {run.id: run for run in list_runs(own)}
+    assert list(runs) == [run.id for run in list_runs(shared)], "in the same order, under the same names"
+    for name in ("replay", "a", "clean"):
+        starts = [run.arm.demonstrations.config.seed_start for run in runs.values() if run.arm.name == name]
+        attempts = [set(range(start, start + SEEDS_APART)) for start in starts]
+        assert len(set.union(*attempts)) == SEEDS_APART * len(starts)
+    bases = [runs[f"fixed/a/seed_{seed}"].arm.demonstrations.config for seed in range(3)]
+    driven = [run.dagger for run in runs.values() if run.arm.name == "driven"]
+    assert [plan.base.seed_start for plan in driven] == [base.seed_start for base in bases]
+    assert len(set.union(*(set(plan.seeds(1)) for plan in driven))) == sum(len(plan.seeds(1)) for plan in driven)
+    for run in runs.values():
+        if run.arm.name == "a":
+            ((arm, data),) = list_pairs([run], [])
+            assert arm is run.arm and data.name == "smoke --noise.sigma=0" and data.moved == run.seed * SEEDS_APART
+    with pytest.raises(InputError, match="may take 2,002 attempts"):
+        list_runs(study(settings={"fixed": Setting("smoke --episodes=1001", {})}, demonstrations="own"))
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
