@@ -100,7 +100,7 @@ def submit(
 
 
 def _versions(recordings: Iterable[Recording]) -> dict[str, str]:
-    return json.loads(_one({one.versions for one in recordings}, "versions of packages"))
+    return json.loads(_one({one.versions for one in recordings}, "versions of packages or makes of processors"))
 
 
 def _one(different: set[str], what: str) -> str:

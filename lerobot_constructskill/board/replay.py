@@ -6,12 +6,11 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from itertools import batched, groupby
 
-from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS, Setting
 from lerobot_constructskill.board.submission import Claim, Submission, is_replayable, width
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import DECIDING, Outcome
+from lerobot_constructskill.envs.recording import Outcome, deciding
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
@@ -29,7 +28,8 @@ class Verdict:
         left: episodes that were not looked at.
         steps: that were executed.
         differences: a sentence for every episode that does not end as claimed.
-        versions: of the packages that decide what an action does, here.
+        versions: of what decides what an action does, here (`envs.recording.deciding`).
+        is_same_make: whether the submission says that it was made on this make of processor.
     """
 
     replayed: int
@@ -38,6 +38,7 @@ class Verdict:
     steps: int
     differences: list[str]
     versions: dict[str, str]
+    is_same_make: bool
 
 
 def replay(submission: Submission, workers: int | None = None, sample: int | None = None) -> Verdict:
@@ -67,7 +68,7 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
         for some in batched(claims, TOGETHER)  # noqa: B911  the last one may be shorter
     ]
     found = _run(jobs, workers, sum(claim.steps for claim in chosen))
-    here = versions(*DECIDING)
+    here = deciding()
     others = _other_versions(declaration.versions, here)
     return Verdict(
         replayed=len(chosen),
@@ -76,6 +77,7 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
         steps=sum(claim.steps for claim in chosen),
         differences=[f"{said}{others}." for said in found],
         versions=here,
+        is_same_make=declaration.versions.get("processor") == here["processor"],
     )
 
 
@@ -92,8 +94,12 @@ def _run(jobs: Sequence[tuple[Setting, Sequence[Claim]]], workers: int | None, s
 def _other_versions(there: dict[str, str], here: dict[str, str]) -> str:
     """What may be the reason for a difference that is nobody's fault."""
     other = {name: ours for name, ours in here.items() if there.get(name) != ours}
-    told = [f"{name} {str(there.get(name))[:40]!a} there, {ours} here" for name, ours in other.items()]
-    return f" (other versions: {'; '.join(told)})" if told else " (with the same versions)"
+    told = [f"{name} {_said(there.get(name))} there, {ours} here" for name, ours in other.items()]
+    return f" (made with others: {'; '.join(told)})" if told else " (with the same versions and make of processor)"
+
+
+def _said(version: str | None) -> str:
+    return "unknown" if version is None else ascii(version[:40])
 
 
 def open_workers(workers: int | None = None) -> AbstractContextManager[Submit]:

@@ -96,7 +96,7 @@ class Declaration:
         settings: name to setting; those of the suite, or others: then the class is custom.
         training_seeds: of the runs that are in it.
         backend: what simulated and rendered.
-        versions: of the packages that decide what an action does.
+        versions: of what decides what an action does: packages, and the make of the processor.
         episodes_sha256: hash of episodes.parquet.
         version: of this format.
 

@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.processor import make
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
@@ -33,6 +34,11 @@ STARTING = ("task", "episode_length", "perturb", "perturb_seed", "obs_type")
 
 DECIDING = ("lerobot_env_constructskill", "sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
+
+
+def deciding() -> dict[str, str]:
+    """Their versions here, and the make of the processor: PhysX computes with approximations that are its own."""
+    return versions(*DECIDING) | {"processor": make()}
 
 
 @dataclass
@@ -66,7 +72,7 @@ class Recording(Outcome):
         task, episode_length, perturb, perturb_seed: as of `ConstructSkillEnv`; with the seed they decide its start.
         obs_type: what the policy was shown.
         backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
-        versions: JSON, package to version.
+        versions: JSON, as `deciding` gives them.
         actions: every executed action, one after another, (steps * A) float32 as `ConstructSkillEnv.step` takes them.
     """
 
@@ -76,7 +82,7 @@ class Recording(Outcome):
     perturb_seed: int = 0
     obs_type: str = ""
     backend: str = ""
-    versions: str = field(default_factory=lambda: json.dumps(versions(*DECIDING)))
+    versions: str = field(default_factory=lambda: json.dumps(deciding()))
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:

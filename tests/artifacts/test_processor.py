@@ -24,3 +24,11 @@ def test_the_first_processors_name_family_and_model(said, name, tmp_path, monkey
         path.write_text(said)
     monkeypatch.setattr(of, "CPUINFO", path)
     assert of.processor.__wrapped__() == name
+
+
+@pytest.mark.parametrize(("said", "name"), [("vendor_id\t: GenuineIntel\n", "GenuineIntel"), ("", platform.machine())])
+def test_its_make(said, name, tmp_path, monkeypatch):
+    path = tmp_path / "cpuinfo"
+    path.write_text(said)
+    monkeypatch.setattr(of, "CPUINFO", path)
+    assert of.make.__wrapped__() == name

@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ import yaml
 from commands import call
 from torchcodec.decoders import VideoDecoder
 
-from lerobot_constructskill.artifacts.processor import processor
+from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.board.protocol import FIRST_FRESH
-from lerobot_constructskill.board.submission import EPISODES
+from lerobot_constructskill.board.submission import EPISODES, Claim, read_submission, write_submission
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -85,3 +86,23 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     content[len(content) // 2] ^= 1
     (entry / EPISODES).write_bytes(content.tobytes())
     assert "its hash differs." in call("constructskill-verify", f"--root={entry}", fails=True)
+
+
+def test_a_difference_on_another_make_of_processor_is_told_as_such(tmp_path):
+    (tmp_path / "about.yaml").write_text(yaml.safe_dump(ABOUT | {"observes": "pixels"}))
+    (tmp_path / "settings.yaml").write_text(yaml.safe_dump(SETTINGS))
+    evaluate(tmp_path / "recorded", 7)
+    files = [f"--{name}={tmp_path / name}.yaml" for name in ("about", "settings")]
+    where = [f"--recorded={tmp_path / 'recorded'}", f"--root={tmp_path / 'true'}"]
+    call("constructskill-submit", "--suite=bins", *files, *where)
+    true = read_submission(tmp_path / "true")
+    declared = {one.name: getattr(true.declaration, one.name) for one in fields(true.declaration)}
+    del declared["episodes_sha256"], declared["version"]
+    assert declared["versions"]["processor"] == make()
+    claims = [Claim(**vars(true.claims[0]) | {"lifted": True, "lift_step": 2, "stage": "lifted"}), *true.claims[1:]]
+    for name, is_told in ((make(), False), ("AnotherMake", True)):
+        versions = declared["versions"] | {"processor": name}
+        write_submission(tmp_path / name, claims, **declared | {"versions": versions})
+        told = call("constructskill-verify", f"--root={tmp_path / name}", fails=True)
+        assert "1 of 4 replayed episodes are not as claimed" in told and "lifted is False, not True" in told
+        assert ("processor 'AnotherMake' there" in told) == ("verify it on the make" in told) == is_told
