@@ -16,6 +16,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import get_task, held_out
 from lerobot_constructskill.dagger.run import make_checkpoint
@@ -207,7 +208,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         weights_sha256=weights,
         environment_sha256=digest({"environment": arm.env, "backend": backend}),
         backend=backend,
-        versions=json.dumps(run.versions | made_of),
+        versions=json.dumps(run.versions | made_of | {"processor": processor()}),
     )
 
 

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from lerobot_constructskill.artifacts.locks import locked
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.envs.recording import RECORDINGS, read_recordings
 from lerobot_constructskill.study.rows import read_rows
 
@@ -173,6 +174,7 @@ def test_the_rows_say_what_happened(undisturbed):
     tiny = finished[finished["variant"] == "tiny"]
     assert tiny["heldout_mse_m2"].between(0, 0.01).all() and tiny["weights_sha256"].nunique() == 2
     assert tiny["versions"].str.contains("vit_tiny16").all()
+    assert {json.loads(one)["processor"] for one in finished["versions"]} == {processor()}
     for row in tiny.itertuples():
         assert json.loads(row.heldout_mse_m2_by_data) == {"smoke": row.heldout_mse_m2}
     failed = undisturbed[undisturbed["error_kind"].notna()]
