@@ -12,8 +12,8 @@ SHOWN = 10
 """Differences that are told in full."""
 
 _OTHER_MAKE = (
-    " Makes of processors differ in the last bits of physics, on which a few episodes in a thousand depend: verify it "
-    "on the make that it was made on."
+    " Makes of processors differ in the last bits of physics, on which an episode seldom depends: verify it on the "
+    "make that it was made on."
 )
 
 
