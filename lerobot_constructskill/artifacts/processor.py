@@ -29,5 +29,6 @@ def make() -> str:
 
 def _facts() -> dict[str, str]:
     """What Linux says of the first core."""
-    lines = CPUINFO.read_text().splitlines() if CPUINFO.exists() else []
-    return dict(reversed([[part.strip() for part in line.split(":", 1)] for line in lines if ":" in line]))
+    first = CPUINFO.read_text().partition("\n\n")[0] if CPUINFO.exists() else ""
+    pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
+    return {name.strip(): value.strip() for name, value in pairs}

@@ -6,11 +6,12 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from itertools import batched, groupby
 
+from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS, Setting
 from lerobot_constructskill.board.submission import Claim, Submission, is_replayable, width
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import Outcome, deciding
+from lerobot_constructskill.envs.recording import DECIDING, Outcome, deciding
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
@@ -28,8 +29,7 @@ class Verdict:
         left: episodes that were not looked at.
         steps: that were executed.
         differences: a sentence for every episode that does not end as claimed.
-        versions: of what decides what an action does, here (`envs.recording.deciding`).
-        is_same_make: whether the submission says that it was made on this make of processor.
+        versions: of the packages that decide what an action does, here.
     """
 
     replayed: int
@@ -38,7 +38,6 @@ class Verdict:
     steps: int
     differences: list[str]
     versions: dict[str, str]
-    is_same_make: bool
 
 
 def replay(submission: Submission, workers: int | None = None, sample: int | None = None) -> Verdict:
@@ -68,16 +67,14 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
         for some in batched(claims, TOGETHER)  # noqa: B911  the last one may be shorter
     ]
     found = _run(jobs, workers, sum(claim.steps for claim in chosen))
-    here = deciding()
-    others = _other_versions(declaration.versions, here)
+    others = _other_versions(declaration.versions, deciding())
     return Verdict(
         replayed=len(chosen),
         failed=len(submission.claims) - len(acted),
         left=len(acted) - len(chosen),
         steps=sum(claim.steps for claim in chosen),
         differences=[f"{said}{others}." for said in found],
-        versions=here,
-        is_same_make=declaration.versions.get("processor") == here["processor"],
+        versions=versions(*DECIDING),
     )
 
 

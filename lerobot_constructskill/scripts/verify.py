@@ -64,7 +64,7 @@ def verify(config: VerifyConfig) -> str:
 
 
 def _record(path: Path, facts: dict) -> None:
-    """Write what was found; the machines that found the same before stay named."""
+    """Write what was found; the machines that found the same before, of whatever make, stay named."""
     from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.artifacts.processor import processor
     from lerobot_constructskill.board.entries import read_verdict
@@ -75,6 +75,7 @@ def _record(path: Path, facts: dict) -> None:
 
 
 def _replayed(submission, config: VerifyConfig):
+    from lerobot_constructskill.artifacts.processor import make
     from lerobot_constructskill.board.replay import replay
 
     verdict = replay(submission, config.workers, config.sample)
@@ -83,7 +84,7 @@ def _replayed(submission, config: VerifyConfig):
         raise InputError(
             f"{len(verdict.differences)} of {verdict.replayed} replayed episodes are not as claimed: "
             f"{' '.join(verdict.differences[:SHOWN])}{f' And {more} more.' if more > 0 else ''}"
-            f"{'' if verdict.is_same_make else _OTHER_MAKE}"
+            f"{'' if submission.declaration.versions.get('processor') == make() else _OTHER_MAKE}"
         )
     return verdict
 

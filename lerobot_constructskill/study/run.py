@@ -40,10 +40,10 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
     runs = list_runs(study)
     chosen = choose(runs, options.only)
     with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
-        with replaced(root / STUDY) as partial:
-            partial.write_text(text)
         table = Table(root, runs, store)
         _check_nothing_is_lost(table)
+        with replaced(root / STUDY) as partial:
+            partial.write_text(text)
         for run in table.failed() if options.retry_failed else []:
             if run in chosen:
                 table.forget_failure(run)

@@ -142,7 +142,7 @@ class Run:
     @cached_property
     def digests(self) -> tuple[str, ...]:
         """That of its episodes, and those that they have where machines of another kind made them."""
-        return tuple(Run(arm, self.seed).artifact.digest for arm in (self.arm, *self.arm.elsewhere))
+        return self.artifact.digest, *(Run(arm, self.seed).artifact.digest for arm in self.arm.elsewhere)
 
     @cached_property
     def versions(self) -> dict[str, str]:

@@ -66,6 +66,7 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     path = tmp_path / "verified" / "entry.json"
     verdict = json.loads(path.read_text())
     assert verdict["level"] == "re-run" and verdict["machines"] == [processor()]
+    assert "processor" not in verdict["versions"], "another make would find something else than the first"
     for sha256, machines in ((verdict["submission"], ["another", processor()]), ("", [processor()])):
         path.write_text(json.dumps(verdict | {"submission": sha256, "machines": ["another"]}))
         call("constructskill-verify", f"--root={entry}", *rerun)

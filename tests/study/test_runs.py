@@ -284,7 +284,8 @@ def test_no_row_is_lost_that_is_nowhere_else(tmp_path):
     fewer, empty = study(variants={"a": study().variants["a"]}), Store(tmp_path / "elsewhere")
     published = read_rows(tmp_path / "x" / "rows.parquet")
     with pytest.raises(InputError, match=r"rows of 2 runs, such as fixed/b/seed_0.* would be lost"):
-        run_study(fewer, "", tmp_path / "x", empty, Options())
+        run_study(fewer, "another", tmp_path / "x", empty, Options())
+    assert (tmp_path / "x" / "study.yaml").read_text() == ""
     pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
     run_study(fewer, "", tmp_path / "x", table.store, Options())
     assert set(read_rows(tmp_path / "x" / "rows.parquet")["variant"]) == {"a", "no_op", "replay"}
