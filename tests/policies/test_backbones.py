@@ -77,6 +77,9 @@ def test_bfloat16_stays_close_and_returns_float32(weights, images):
 
 
 NATIVE = [precision for precision in PRECISIONS if is_native(precision, "cpu")]
+ROUNDING = 1e-4
+"""Of a feature's norm. What float32 sums in another order move: up to 1.2e-5 (EfficientNet-Lite2's maps, on a CPU with AVX2
+and on one with AVX-512). bfloat16 moves 0.3 to 13 %."""
 
 
 @pytest.mark.parametrize(
@@ -94,7 +97,7 @@ def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name
     assert encoder.runtime == "torch"
     eager, exact = (encoder._encode_eagerly(encoder.preprocess(images), kind) for kind in (precision, "float32"))
     for ours, eagerly, exactly in zip((together, patches), eager, exact, strict=True):
-        assert (ours - exactly).norm() < 2 * (eagerly - exactly).norm() + 1e-5 * exactly.norm()
+        assert (ours - exactly).norm() < 2 * (eagerly - exactly).norm() + ROUNDING * exactly.norm()
 
 
 def test_weights_loaded_after_the_first_image_are_the_ones_used(weights, images):
