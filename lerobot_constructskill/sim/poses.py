@@ -1,8 +1,11 @@
-"""Poses of one robot on a CPU, with the numbers of ManiSkill's batched ones to the last bit.
+"""Poses of one robot on a CPU, with the numbers of ManiSkill's batched ones to the last bit, and of cameras.
 
-ManiSkill's go through torch, where a sum of two numbers costs microseconds and a pose takes a hundred of them. These
-are the same float32 operations in the same order, on numpy's scalars.
+ManiSkill's go through torch, where a sum of two numbers costs microseconds and a pose takes a hundred of them. Those
+of the robot are the same float32 operations in the same order, on numpy's scalars.
 """
+
+from collections.abc import Sequence
+from math import copysign, sqrt
 
 import numpy as np
 import sapien
@@ -26,6 +29,25 @@ def relative_pose(frame: sapien.Pose, pose: sapien.Pose) -> tuple[Numbers, Numbe
     origin = rotate(turn, tuple(-number for number in frame.p))
     p = tuple(a + b for a, b in zip(origin, rotate(turn, tuple(pose.p)), strict=True))
     return p, multiply(turn, tuple(pose.q))
+
+
+def looking_from(eye: Sequence[float], target: Sequence[float]) -> sapien.Pose:
+    """Of a camera at `eye` that looks at `target`, both in metres, upright and neither straight up nor down.
+
+    It looks along its x axis. ManiSkill's `look_at` takes roots in float32 with MKL, which is off by a bit on some
+    processors and then shows in a few pixels; here, every number is rounded to float32 once.
+    """
+    x, y, z = (float(b) - float(a) for a, b in zip(eye, target, strict=True))
+    level = sqrt(x * x + y * y)
+    yaw_cos, yaw_sin = half_turn(x / level, y)
+    pitch_cos, pitch_sin = half_turn(level / sqrt(x * x + y * y + z * z), -z)
+    q = (yaw_cos * pitch_cos, -yaw_sin * pitch_sin, yaw_cos * pitch_sin, yaw_sin * pitch_cos)
+    return sapien.Pose(p=eye, q=q)
+
+
+def half_turn(cosine: float, side: float) -> tuple[float, float]:
+    """Cosine and sine of half an angle, of which the cosine and the sine's sign are known."""
+    return sqrt((1 + cosine) / 2), copysign(sqrt((1 - cosine) / 2), side)
 
 
 def invert(q: Numbers) -> Numbers:

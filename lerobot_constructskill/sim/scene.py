@@ -14,7 +14,6 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
-from mani_skill.utils.sapien_utils import look_at
 from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
@@ -33,7 +32,7 @@ from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.perturb import Draws
-from lerobot_constructskill.sim.poses import seen_from
+from lerobot_constructskill.sim.poses import looking_from, seen_from
 from lerobot_constructskill.sim.rendering import best_render_backend
 from lerobot_constructskill.sim.shader import colour_shader
 from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
@@ -186,7 +185,7 @@ class PickPlaceEnv(BaseEnv):
 
     def _camera_config(self, camera: Camera) -> CameraConfig:
         if camera.mount is None:
-            view = {"pose": look_at(self.draws.eye(camera.eye), camera.target)}
+            view = {"pose": looking_from(self.draws.eye(camera.eye), camera.target)}
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
@@ -201,7 +200,7 @@ class PickPlaceEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = look_at([0.9, -1.0, 0.8], [-0.1, -0.15, 0.15])
+        pose = looking_from((0.9, -1.0, 0.8), (-0.1, -0.15, 0.15))
         return CameraConfig("render_camera", pose=pose, width=512, height=512, fov=0.9)
 
     def _load_agent(self, options: dict) -> None:
@@ -362,10 +361,11 @@ class PickPlaceEnv(BaseEnv):
         """Proprioception as `contract.STATE_NAMES` names it, (num_envs, 8), in the robot's base frame.
 
         The gripper points down, half a turn about x, where the usual axis-angle jumps between +pi and -pi; the
-        sign of the quaternion is chosen so that the x component stays positive and continuous there.
+        sign of the quaternion is chosen so that the x component stays positive and continuous there. Computed in
+        float64 and rounded once, because torch's float32 sines differ by a bit between instruction sets.
         """
         tcp = seen_from(self.agent.robot.root, self.agent.tcp)
-        rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q))
+        rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q).double()).float()
         return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
 
     def privileged_state(self) -> dict[str, torch.Tensor]:
