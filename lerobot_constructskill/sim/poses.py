@@ -39,13 +39,13 @@ def looking_from(eye: Sequence[float], target: Sequence[float]) -> sapien.Pose:
     """
     x, y, z = (float(b) - float(a) for a, b in zip(eye, target, strict=True))
     level = sqrt(x * x + y * y)
-    yaw_cos, yaw_sin = half_turn(x / level, y)
-    pitch_cos, pitch_sin = half_turn(level / sqrt(x * x + y * y + z * z), -z)
+    yaw_cos, yaw_sin = half_angle(x / level, y)
+    pitch_cos, pitch_sin = half_angle(level / sqrt(x * x + y * y + z * z), -z)
     q = (yaw_cos * pitch_cos, -yaw_sin * pitch_sin, yaw_cos * pitch_sin, yaw_sin * pitch_cos)
     return sapien.Pose(p=eye, q=q)
 
 
-def half_turn(cosine: float, side: float) -> tuple[float, float]:
+def half_angle(cosine: float, side: float) -> tuple[float, float]:
     """Cosine and sine of half an angle, of which the cosine and the sine's sign are known."""
     return sqrt((1 + cosine) / 2), copysign(sqrt((1 - cosine) / 2), side)
 

@@ -108,10 +108,10 @@ def in_order(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The same surface, uncoloured, with its faces in the order of where they are, and vertices as faces need them.
 
     NumPy's sorts are not stable, and each instruction set has its own: trimesh leaves the same triangles in another
-    order with AVX2 and without, which pictures show (some 800 pixels of the base camera's, by up to 40 levels of 255).
+    order with AVX2 and without, which pictures show.
     """
     _, place = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    places = place.reshape(-1)[mesh.faces]
+    places = place[mesh.faces]
     turns = (np.arange(3) + places.argmin(axis=1)[:, None]) % 3
     faces, places = (np.take_along_axis(corners, turns, axis=1) for corners in (mesh.faces, places))
     corners = faces[np.lexsort(places.T[::-1])].reshape(-1).tolist()

@@ -63,7 +63,7 @@ def execute(task: str) -> tuple[dict, dict, bool]:
 def videos(root: Path) -> dict[str, str]:
     """Hashes of the videos of one demonstration with both cameras, made in a folder.
 
-    Not of its rows: what a CPU without AVX-512 computes of the robot's state can differ in the last bit.
+    Not of its rows: that CPUs with and without AVX-512 come to the same last bits has not been confirmed.
     """
     record(GenerateConfig("local/held", str(root), task=TASKS[0], episodes=1, obs_type="pixels_agent_pos"))
     made = sorted(root.glob("videos/**/*.mp4"))

@@ -18,20 +18,14 @@ pytestmark = pytest.mark.sim
 NEWER = "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 """Instruction sets that NumPy sorts with in ways of their own, where a CPU has them."""
 
-BUILD = """
-import sys
-from pathlib import Path
-from lerobot_constructskill.sim import visuals
-visuals._build_light_panda(Path(visuals.Panda.urdf_path), Path(sys.argv[1]))
-"""
+BUILD = "from lerobot_constructskill.sim.visuals import light_panda_urdf; light_panda_urdf()"
 
 
-def build(folder: Path, without: str) -> dict[str, np.ndarray]:
+def build(cache: Path, without: str) -> dict[str, np.ndarray]:
     """The light robot's triangles, as a process makes them whose NumPy leaves out some instruction sets."""
-    folder.mkdir()
-    env = os.environ | {"NPY_DISABLE_CPU_FEATURES": without}
-    subprocess.run([sys.executable, "-c", BUILD, str(folder)], env=env, check=True, capture_output=True)
-    scenes = {path.name: trimesh.load_scene(path) for path in sorted(folder.glob("*.glb"))}
+    env = os.environ | {"NPY_DISABLE_CPU_FEATURES": without, "XDG_CACHE_HOME": str(cache)}
+    subprocess.run([sys.executable, "-c", BUILD], env=env, check=True, capture_output=True)
+    scenes = {path.name: trimesh.load_scene(path) for path in sorted(cache.rglob("*.glb"))}
     return {f"{name}/{key}": part.triangles for name, scene in scenes.items() for key, part in scene.geometry.items()}
 
 
