@@ -100,7 +100,7 @@ EXTERNALS = {
     "board": {"huggingface_hub", "jinja2", "markupsafe", "numpy", "pyarrow", "yaml"},
     "analysis": set(),
     "analysis.stats": {"numpy", "pandas", "scipy", "statsmodels"},
-    "analysis.report": {"draccus", "jinja2", "markupsafe", "matplotlib", "numpy", "pandas", "yaml"},
+    "analysis.report": {"PIL", "draccus", "jinja2", "markupsafe", "matplotlib", "numpy", "pandas", "yaml"},
 }
 
 

@@ -14,7 +14,6 @@ import task_pages
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 ASSETS = Path(__file__).parent / "assets"
@@ -55,13 +54,6 @@ def on_page_markdown(markdown: str, page: Page, **_) -> str:
 
     markdown = LINK.sub(lead, markdown)
     return task_pages.with_links(markdown) if page.file.src_uri == "docs/tasks.md" else markdown
-
-
-def on_post_build(config: MkDocsConfig) -> None:
-    """Store the plots of the reports with 64 colours, which look the same in less than a third of the room."""
-    for figure in Path(config.site_dir).glob("results/*/figures/*.png"):
-        with Image.open(figure) as image:
-            image.convert("RGB").quantize(64).save(figure, optimize=True)
 
 
 def reached(pages: list[Path]) -> list[Path]:

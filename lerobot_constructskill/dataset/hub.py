@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 PUSHED = [
     "README.md",
-    "pictures/contact_sheet.png",
+    "pictures/contact_sheet.jpg",
     "pictures/trajectories.png",
     "meta/*.json",
     "meta/*.parquet",

@@ -70,4 +70,4 @@ def _frames(data: DataSet, camera: str, rows: set[int]) -> dict[int, np.ndarray]
 
 def _save(figure: Figure, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, pil_kwargs={"quality": 90})

@@ -10,7 +10,7 @@ from lerobot_constructskill.scripts.console import run
 
 @dataclass
 class CardConfig:
-    """Write README.md, pictures/contact_sheet.png and pictures/trajectories.png for a data set."""
+    """Write README.md, pictures/contact_sheet.jpg and pictures/trajectories.png for a data set."""
 
     root: Path  # the data set's folder
     repo_id: RepoId | None = None  # its name on the Hub; default: the one it was generated under
@@ -35,7 +35,7 @@ def write_card(config: CardConfig) -> str:
 
     data, out = open_dataset(config.root), config.out or config.root
     facts = card_facts(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
-    contact_sheet(data, out / "pictures" / "contact_sheet.png")
+    contact_sheet(data, out / "pictures" / "contact_sheet.jpg")
     trajectories(data, out / "pictures" / "trajectories.png")
     with replaced(out / "README.md") as partial:
         partial.write_text(render(facts))

@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,8 @@ STYLE = {
     "svg.hashsalt": "constructskill",
 }
 
-UNDATED = {"png": None, "svg": {"Date": None}}
-"""Metadata with which a file is the same whenever it is written."""
+SHADES = 64
+"""Colours of a figure's PNG, which looks the same with them in a third of the room."""
 
 
 @dataclass(frozen=True)
@@ -106,25 +107,32 @@ class Picture:
 
 def picture(drawing: Drawing, folder: Path) -> Picture:
     """Draw `drawing` on both papers, and write the light one to `folder` as `<name>.png`."""
-    png, light = encoded(drawing, LIGHT, "png", "svg")
-    (dark,) = encoded(drawing, DARK, "svg")
+    png, light = encoded(drawing, LIGHT, _png, _svg)
+    (dark,) = encoded(drawing, DARK, _svg)
     (folder / f"{drawing.name}.png").write_bytes(png)
     return Picture(drawing.name, drawing.caption, _uri(light), _uri(dark))
 
 
-def encoded(drawing: Drawing, ink: Ink, *formats: str) -> list[bytes]:
-    """One figure as the bytes of a file of each format, the same at every call."""
+def encoded(drawing: Drawing, ink: Ink, *encoders: Callable[[Figure], bytes]) -> list[bytes]:
+    """One figure as the bytes of a file of each kind, the same at every call."""
     with styled(ink), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # labels may hold any script
         figure = drawing.draw(ink)
         FigureCanvasAgg(figure).draw()
-        figure.set_layout_engine("none")  # laid out once, for all formats
-        return [_bytes(figure, suffix) for suffix in formats]
+        figure.set_layout_engine("none")  # laid out once, for all files
+        return [encode(figure) for encode in encoders]
 
 
-def _bytes(figure: Figure, suffix: str) -> bytes:
+def _png(figure: Figure) -> bytes:
+    drawn, target = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=200)
+    Image.open(drawn).convert("RGB").quantize(SHADES).save(target, format="png", optimize=True)
+    return target.getvalue()
+
+
+def _svg(figure: Figure) -> bytes:
     target = io.BytesIO()
-    figure.savefig(target, format=suffix, dpi=200, metadata=UNDATED[suffix])
+    figure.savefig(target, format="svg", metadata={"Date": None})  # the same bytes whenever it is written
     return target.getvalue()
 
 
