@@ -2,14 +2,16 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
+
+import yaml
 
 from lerobot_constructskill.board.protocol import Setting
 from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, read_rows
 
 SEED = r"seed_(\d{1,9})"
 
@@ -34,19 +36,26 @@ def recorded_in(root: Path) -> Piles:
     return {seed: [one for path in paths for one in read_recordings(path)] for seed, paths in files.items()}
 
 
-def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
-    """What a variant's runs did in all settings of a study, and why some failed.
+def of_study(root: Path, store: Path, variant: str, tasks: Collection[str]) -> tuple[Piles, Failures]:
+    """What a variant's runs did in those settings of a study that evaluate one of `tasks`, and why some failed.
 
     Raises:
         MissingError: the study, or what one of its runs executed, is not there.
-        InputError: the study has no such variant.
+        InputError: the study has no such variant, or not in a setting with one of the tasks.
     """
-    if not (root / ROWS).is_file():
-        raise MissingError(f"'{root}' is not the folder of a study: {ROWS} is missing.")
+    for name in (STUDY, ROWS):
+        if not (root / name).is_file():
+            raise MissingError(f"'{root}' is not the folder of a study: {name} is missing.")
     rows = read_rows(root / ROWS)
     own = rows[rows["variant"] == variant]
     if own.empty:
         raise InputError(f"The study has no variant '{variant}'; it has: {', '.join(rows['variant'].unique())}.")
+    task_of = _tasks(root / STUDY)
+    own = own[own["setting"].map(task_of).isin(tasks)]
+    if own.empty:
+        raise InputError(
+            f"'{variant}' was evaluated on none of {', '.join(tasks)}, but on {', '.join(task_of.values())}."
+        )
     piles: Piles = {}
     failures: Failures = {}
     for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
@@ -65,6 +74,15 @@ def of_study(root: Path, store: Path, variant: str) -> tuple[Piles, Failures]:
             )
         pile += read_recordings(path)
     return piles, failures
+
+
+def _tasks(path: Path) -> dict[str, str]:
+    """The task of each of a study's settings."""
+    try:
+        settings = yaml.safe_load(path.read_text())["settings"]
+        return {name: of["env"]["task"] for name, of in settings.items()}
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+        raise InputError(f"'{path}' is not a study's file, or a setting in it does not say env.task.") from None
 
 
 def submit(

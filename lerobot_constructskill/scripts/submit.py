@@ -51,13 +51,15 @@ def submit(config: SubmitConfig) -> str:
     from lerobot_constructskill.board.submission import EPISODES, About
 
     about = make(About, read_yaml(config.about.read_bytes(), str(config.about)), str(config.about))
+    settings = _settings(config)
     failures = {int(seed): why for seed, why in config.failures.items()}
     if config.study is None:
         piles = collect.recorded_in(config.recorded)
     else:
-        piles, said = collect.of_study(config.study, config.store, config.variant)
+        piles, said = collect.of_study(
+            config.study, config.store, config.variant, {setting.task for setting in settings.values()}
+        )
         failures = said | failures
-    settings = _settings(config)
     made = collect.submit(config.root, about, config.suite, settings, piles, failures)
     size = (config.root / EPISODES).stat().st_size
     return (

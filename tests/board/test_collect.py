@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+import yaml
 
 from lerobot_constructskill.board.collect import of_study, recorded_in, submit
 from lerobot_constructskill.board.protocol import Setting
 from lerobot_constructskill.board.submission import About
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Row, write_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
 
 SETTINGS = {"block": Setting("block_to_bin", episodes=2, episode_length=2, first_start=7, perturb="pose=1")}
 ABOUT = About(*["a test's"] * 7, observes="pixels")
@@ -68,24 +69,58 @@ def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
         recorded_in(tmp_path / "nowhere")
 
 
-def test_a_studys_runs_become_a_submission(tmp_path):
+FACTS = {
+    "setting": "block",
+    "variant": "ours",
+    "role": "variant",
+    "episodes": 2,
+    "training_seed": 0,
+    "evaluation_seed": 7,
+    "episode": 0,
+}
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Two settings, of which one evaluates the task that a submission is made of."""
+    settings = {"block": {"env": {"task": "block_to_bin"}}, "brick": {"env": {"task": "brick_to_bin"}}}
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / STUDY).write_text(yaml.safe_dump({"name": "study", "settings": settings}))
+    return tmp_path / "study"
+
+
+def test_a_studys_runs_become_a_submission(study, tmp_path):
     rows, store = [], tmp_path / "store"
-    facts = {"setting": "block", "variant": "ours", "role": "variant", "episodes": 2}
     for seed in range(2):
         write_recordings([recording(7, 0.01 * (seed + 1)), recording(8)], store / "runs" / f"d{seed}" / RECORDINGS)
         for episode in range(2):
-            rows.append(Row(run=f"d{seed}", training_seed=seed, evaluation_seed=7 + episode, episode=episode, **facts))
-    failed = {"run": "d2", "training_seed": 2, "evaluation_seed": 7, "episode": 0, **facts}
-    write_rows([*rows, Row(**failed, error_kind="fault", error="lost\nthe plot")], tmp_path / "study" / ROWS)
-    piles, failures = of_study(tmp_path / "study", store, "ours")
+            start = {"training_seed": seed, "evaluation_seed": 7 + episode, "episode": episode}
+            rows.append(Row(run=f"d{seed}", **FACTS | start))
+    rows.append(Row(run="d2", **FACTS | {"training_seed": 2}, error_kind="fault", error="lost\nthe plot"))
+    rows.append(Row(run="d3", **FACTS | {"setting": "brick"}, error_kind=NOT_RUN))
+    write_rows(rows, study / ROWS)
+    piles, failures = of_study(study, store, "ours", ["block_to_bin"])
     assert {seed: len(pile) for seed, pile in piles.items()} == {0: 2, 1: 2, 2: 0} and failures == {2: "lost the plot"}
     assert len(made(tmp_path / "made", piles, failures).claims) == 6
 
+
+def test_what_a_study_does_not_have_is_said(study, tmp_path):
+    def collected(row, variant="ours", tasks=("block_to_bin",)):
+        write_rows([row], study / ROWS)
+        return of_study(study, tmp_path / "store", variant, tasks)
+
+    row = Row(run="d9", **FACTS)
     with pytest.raises(InputError, match="it has: ours"):
-        of_study(tmp_path / "study", store, "theirs")
-    write_rows([Row(**failed, error_kind=NOT_RUN)], tmp_path / "study" / ROWS)
-    with pytest.raises(MissingError, match="not run block/ours/seed_2 yet"):
-        of_study(tmp_path / "study", store, "ours")
-    write_rows([Row(**failed | {"run": "d9"})], tmp_path / "study" / ROWS)
+        collected(row, "theirs")
+    with pytest.raises(InputError, match="none of tile_to_grid, but on block_to_bin, brick_to_bin"):
+        collected(row, tasks=["tile_to_grid"])
     with pytest.raises(MissingError, match="before actions were kept"):
-        of_study(tmp_path / "study", store, "ours")
+        collected(row)
+    with pytest.raises(MissingError, match="not run block/ours/seed_0 yet"):
+        collected(Row(run="d9", **FACTS, error_kind=NOT_RUN))
+    (study / STUDY).write_text("settings: {block: {}}")
+    with pytest.raises(InputError, match="does not say env.task"):
+        collected(row)
+    (study / STUDY).unlink()
+    with pytest.raises(MissingError, match="study.yaml is missing"):
+        collected(row)
