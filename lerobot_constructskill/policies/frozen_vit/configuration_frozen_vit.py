@@ -11,7 +11,8 @@ from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, che
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
-from .backbones import IMAGE_SIZE, check_backbone
+from .backbone import IMAGE_SIZE
+from .backbones import check_backbone
 from .features import feature_key
 from .heads import REGRESSION_LOSSES
 from .precision import AUTO, PRECISIONS

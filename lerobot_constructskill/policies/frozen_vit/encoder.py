@@ -8,7 +8,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from . import openvino
-from .backbones import IMAGE_SIZE, Backbone
+from .backbone import IMAGE_SIZE, Backbone
 from .precision import is_native
 
 GREY = 0.5

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_constructskill.errors import InputError, MissingError
 
-from .backbones import IMAGE_SIZE, Backbone
+from .backbone import IMAGE_SIZE, Backbone
 from .precision import PRECISIONS
 
 FEATURE_PREFIX = "observation.features."

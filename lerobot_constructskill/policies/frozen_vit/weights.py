@@ -20,7 +20,7 @@ from torch import Tensor
 
 from lerobot_constructskill.errors import InputError, MissingWeightsError, first_line
 
-from .backbones import Backbone
+from .backbone import Backbone
 
 WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError, MissingWeightsError, first_line
 
-from .backbones import IMAGE_SIZE, IMAGENET_MEAN, IMAGENET_STD, Backbone, without_loss
+from .backbone import IMAGE_SIZE, IMAGENET_MEAN, IMAGENET_STD, Backbone, without_loss
 from .weights import hub_file
 
 DESCRIPTIONS = ("config.json", "preprocessor_config.json")
