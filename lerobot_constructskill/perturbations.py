@@ -49,24 +49,33 @@ class Perturbation:
     seed: int = 0
 
     def __post_init__(self):
-        for name, level in self._pairs():
+        pairs = self._pairs()
+        for name, level in pairs:
             if name not in AXES:
                 raise InputError(f"Unknown perturbation '{name}'; the axes are: {', '.join(AXES)}.")
             highest = len(AXES[name].levels)
             if not level.isdecimal() or int(level) > highest:
                 raise InputError(f"The level of '{name}' must be 0 to {highest}, not '{level}'.")
+        if len(dict(pairs)) < len(pairs):
+            raise InputError(f"Each axis has one level; '{self.levels}' names one twice.")
 
     def _pairs(self) -> list[tuple[str, str]]:
         parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]
         return [(name.strip(), level.strip()) for name, _, level in parts]
 
+    def _level(self, axis: str) -> int:
+        return int(dict(self._pairs()).get(axis, 0))
+
     def amount(self, axis: str) -> float:
         """The number of the level at which `axis` is perturbed, in the axis's unit; 0 where it is not."""
-        level = int(dict(self._pairs()).get(axis, 0))
+        level = self._level(axis)
         return AXES[axis].levels[level - 1] if level else 0.0
 
     @property
     def label(self) -> str:
-        """How results are marked: empty without a perturbation, else such as `+camera=2+light=1+seed=0`."""
-        named = [f"+{name}={level}" for name, level in self._pairs() if level != "0"]
+        """How results are marked: empty without a perturbation, else such as `+camera=2+light=1+seed=0`.
+
+        Two spellings of one perturbation have one label.
+        """
+        named = [f"+{axis}={level}" for axis in AXES if (level := self._level(axis))]
         return "".join([*named, f"+seed={self.seed}"]) if named else ""

@@ -68,7 +68,7 @@ class Entry:
     @property
     def missing_seeds(self) -> int:
         """How many of the protocol's training seeds it lacks."""
-        return 0 if self.is_reference else max(0, TRAINING_SEEDS - len(self.said.training_seeds))
+        return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.said.training_seeds})
 
     @cached_property
     def standings(self) -> dict[str, Standing]:

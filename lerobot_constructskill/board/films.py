@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.board.entries import Entry
-from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.protocol import HORIZON, Setting
 from lerobot_constructskill.board.replay import open_simulator, open_workers
 from lerobot_constructskill.board.submission import Claim, is_replayable, width
 from lerobot_constructskill.contract import FPS
@@ -57,11 +57,12 @@ def _films(entry: Entry, setting: str) -> dict[str, Claim]:
 
 
 def _film(setting: Setting, claim: Claim, path: Path) -> None:
+    """Film an episode's first `HORIZON` steps: a stranger's setting may have 10,000, whose frames take 8 GB."""
     env = open_simulator(setting, "auto")
     try:
         env.reset(seed=claim.evaluation_seed)
         frames = [env.render()]
-        for action in claim.actions.reshape(-1, width(setting)):
+        for action in claim.actions.reshape(-1, width(setting))[:HORIZON]:
             _, _, terminated, truncated, _ = env.step(action)
             frames.append(env.render())
             if terminated or truncated:

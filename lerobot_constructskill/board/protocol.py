@@ -1,5 +1,6 @@
 """The protocol's numbers, which have their one home here: suites, starts, episodes, training seeds, limits."""
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from hashlib import sha256
 from typing import Annotated
@@ -16,8 +17,8 @@ FIRST_START = 5000
 EPISODES = 50
 """Starts of every setting whose initial state is drawn."""
 
-TRAINING_SEEDS = 10
-"""Training runs of a policy that is trained for the board: its seeds 0 to 9."""
+TRAINING_SEEDS = range(10)
+"""Of a policy that is trained for the board. Nobody chooses them: ten others could be the best of a hundred."""
 
 RANKED_FROM = 3
 """Training seeds below which an entry has no rank."""
@@ -48,7 +49,7 @@ CLAIMED, REPLAYED, RERUN = LEVELS = ("claimed", "replayed", "re-run")
 checkpoint does as well on starts that nobody could know when it was submitted."""
 
 STANDARD, CUSTOM = CLASSES = ("standard", "custom")
-"""A submission whose settings are exactly those of its suite, and any other."""
+"""A submission with exactly the settings of its suite and training seeds of the protocol, and any other."""
 
 FIRST_FRESH = 2**30
 """Starts of re-runs lie from here on: above those of demonstrations (1,000,000 on) and of every protocol."""
@@ -125,9 +126,10 @@ SUITES = {
 """Every suite of the board, by name."""
 
 
-def class_of(suite: str, settings: dict[str, Setting]) -> str:
-    """`STANDARD` where settings are those of a suite, else `CUSTOM`. Nobody declares it: it is compared."""
-    return STANDARD if settings == SUITES[suite].settings else CUSTOM
+def class_of(suite: str, settings: Mapping[str, Setting], training_seeds: Iterable[int]) -> str:
+    """`STANDARD` with a suite's settings and the protocol's seeds, else `CUSTOM`. It is compared, not declared."""
+    is_standard = settings == SUITES[suite].settings and set(TRAINING_SEEDS) >= set(training_seeds)
+    return STANDARD if is_standard else CUSTOM
 
 
 def fresh_start(submission: str, value: str) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_constructskill.analysis.stats.comparisons import holm
 from lerobot_constructskill.analysis.stats.spread import mean_p_value
-from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
+from lerobot_constructskill.board.protocol import RERUN_ALPHA, Setting, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.errors import InputError
 
@@ -70,7 +70,7 @@ def instructions(submission: Submission, value: str) -> str:
     settings = fresh_settings(declaration.settings, first)
     lines = [f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:"]
     for setting in settings.values():
-        perturb = f" --env.perturb={setting.perturb} --env.perturb_seed={setting.perturb_seed}" * bool(setting.perturb)
+        perturb = f" --env.perturb='{setting.perturb}' --env.perturb_seed={setting.perturb_seed}" * _is_drawn(setting)
         lines.append(
             "CONSTRUCTSKILL_RECORD=recorded/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
             f"--env.task={setting.task} --env.obs_type={declaration.about.observes} "
@@ -79,12 +79,17 @@ def instructions(submission: Submission, value: str) -> str:
         )
     lines.append("Then make a submission of it with these settings, and verify it with --value and --rerun:")
     for name, one in settings.items():
-        perturbed = f", perturb: '{one.perturb}', perturb_seed: {one.perturb_seed}" * bool(one.perturb)
+        perturbed = f", perturb: '{one.perturb}', perturb_seed: {one.perturb_seed}" * _is_drawn(one)
         lines.append(
-            f"{name}: {{task: {one.task}, episodes: {one.episodes}, "
+            f"'{name}': {{task: {one.task}, episodes: {one.episodes}, "
             f"episode_length: {one.episode_length}, first_start: {first}{perturbed}}}"
         )
     return "\n".join(lines)
+
+
+def _is_drawn(setting: Setting) -> bool:
+    """Whether its perturbation is other than the default's."""
+    return bool(setting.perturb or setting.perturb_seed)
 
 
 def compare(submission: Submission, again: Submission, value: str) -> Comparison:
@@ -96,7 +101,7 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
     first = fresh_start(submission.sha256, value)
     if again.declaration.settings != fresh_settings(submission.declaration.settings, first):
         raise InputError(f"{value!a:.80} calls for the starts from {first} on; the re-run has others.")
-    if again.declaration.training_seeds != submission.declaration.training_seeds:
+    if set(again.declaration.training_seeds) != set(submission.declaration.training_seeds):
         raise InputError("The re-run does not have the submission's training seeds.")
     names = sorted(submission.declaration.settings)
     pairs = [(placed(submission, name), placed(again, name)) for name in names]

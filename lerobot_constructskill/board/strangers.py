@@ -4,6 +4,7 @@ import os
 import resource
 import stat
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
@@ -49,7 +50,7 @@ def _read(path: Path, most: int) -> bytes:
 
 
 class _Plain(yaml.SafeLoader):
-    """YAML as a list of settings needs it: no tags, no anchors, no key twice."""
+    """YAML as a list of settings needs it: no tags, no anchors, no key twice, no number that cannot be printed."""
 
     def compose_node(self, parent, index):
         event = self.peek_event()
@@ -58,10 +59,16 @@ class _Plain(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node, deep=False):
-        keys = [self.construct_object(key) for key, _ in node.value]
-        if twice := [key for key in keys if keys.count(key) > 1]:
+        keys = Counter(self.construct_object(key) for key, _ in node.value)
+        if twice := [key for key, count in keys.items() if count > 1]:
             raise InputError(f"{twice[0]!a} appears twice")
         return super().construct_mapping(node, deep)
+
+    def construct_object(self, node, deep=False):
+        value = super().construct_object(node, deep)
+        if isinstance(value, int) and value.bit_length() > 64:
+            raise InputError("a number in it has more than 64 bits")
+        return value
 
 
 def read_yaml(content: bytes, name: str) -> Any:
@@ -74,7 +81,8 @@ def read_yaml(content: bytes, name: str) -> Any:
         return yaml.load(content.decode(), _Plain)
     except RecursionError:
         raise InputError(f"{name} cannot be read: it is nested too deeply.") from None
-    except (InputError, ValueError, TypeError, yaml.YAMLError) as error:  # a key that cannot be one is a TypeError
+    # A key that cannot be one is a TypeError, a number in too many parts an OverflowError.
+    except (InputError, ValueError, TypeError, OverflowError, yaml.YAMLError) as error:
         raise InputError(f"{name} cannot be read: {first_line(error)}.") from None
 
 

@@ -7,7 +7,7 @@ episodes.parquet  `SCHEMA`
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -93,7 +93,7 @@ class Declaration:
     Args:
         about: the policy.
         suite: a name in `protocol.SUITES`.
-        settings: name to setting; those of the suite, or others: then the class is custom.
+        settings: name to setting; those of the suite, or others.
         training_seeds: of the runs that are in it.
         backend: what simulated and rendered.
         versions: of what decides what an action does: packages, and the make of the processor.
@@ -131,7 +131,7 @@ class Declaration:
 
     @property
     def settings_class(self) -> str:
-        return class_of(self.suite, self.settings)
+        return class_of(self.suite, self.settings, self.training_seeds)
 
     @property
     def episodes(self) -> int:
@@ -225,13 +225,14 @@ def write_submission(root: Path, claims: Iterable[Claim], **declared: Any) -> Su
         TakenError: the folder exists.
         InputError: it would be refused.
     """
+    unhashed = Declaration(**declared, episodes_sha256="0" * 64)
     with staged(root) as folder:
         folder.mkdir()
         columns = [vars(claim) for claim in claims]
         table = pa.Table.from_pylist(columns, schema=SCHEMA)
         pq.write_table(table, folder / EPISODES, **compressed("actions"))
         hashed = hashlib.sha256((folder / EPISODES).read_bytes()).hexdigest()
-        plain = asdict(Declaration(**declared, episodes_sha256=hashed))
+        plain = asdict(replace(unhashed, episodes_sha256=hashed))
         (folder / DECLARATION).write_text(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=119))
         submission = read_submission(folder)
     return submission

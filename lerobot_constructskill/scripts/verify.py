@@ -64,14 +64,19 @@ def verify(config: VerifyConfig) -> str:
 
 
 def _record(path: Path, facts: dict) -> None:
-    """Write what was found; the machines that found the same before, of whatever make, stay named."""
+    """Write what was found. What else is known of the submission stays: other machines that found it, and a re-run."""
     from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.artifacts.processor import processor
     from lerobot_constructskill.board.entries import read_verdict
+    from lerobot_constructskill.board.protocol import CLAIMED, LEVELS
 
-    machines = dict.fromkeys([*read_verdict(path, facts).get("machines", []), processor()])
+    before = read_verdict(path, {"submission": facts["submission"]})
+    if LEVELS.index(before.get("level", CLAIMED)) > LEVELS.index(facts["level"]):
+        facts = facts | {"level": before["level"], "rerun": before["rerun"]}
+    earlier = before["machines"] if before.get("versions") == facts["versions"] else []
     with replaced(path) as partial:
-        partial.write_text(json.dumps(facts | {"machines": list(machines)}, indent=2) + "\n")
+        machines = list(dict.fromkeys([*earlier, processor()]))
+        partial.write_text(json.dumps(facts | {"machines": machines}, indent=2) + "\n")
 
 
 def _replayed(submission, config: VerifyConfig):

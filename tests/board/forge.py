@@ -239,6 +239,14 @@ def a_key_twice(root, rng):
 
 
 @forges(READ)
+def a_number_of_too_many_digits(root, rng):
+    """Python refuses to print it, in a refusal for instance, and to turn it into a float."""
+    number = rng.choice(["0x" + "f" * 5000, "1:" + "59:" * 15_000 + "59.5", "-0x" + "e" * 4000])
+    text = (root / DECLARATION).read_text()
+    (root / DECLARATION).write_text(text.replace("version: 1\n", f"version: {number}\n"))
+
+
+@forges(READ)
 def a_huge_declaration(root, rng):
     overwrite(root, "# " + "x" * (1 << 17) + "\n")
 

@@ -6,16 +6,20 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from lerobot_constructskill.artifacts import processor
+from lerobot_constructskill.board import films
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.exports import eval_info
-from lerobot_constructskill.board.protocol import SUITES, Setting
+from lerobot_constructskill.board.protocol import HORIZON, SUITES, Setting
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.scripts.verify import _record
 
 BOARD = Path(__file__).parents[2] / "board"
 
@@ -120,6 +124,47 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
         read_entries(root)
     with pytest.raises(MissingError, match="is not a board"):
         read_entries(tmp_path / "nothing")
+
+
+def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
+    path, versions = tmp_path / "entry.json", {"sapien": "3"}
+    replayed = {"submission": "0" * 64, "level": "replayed", "versions": versions}
+    rerun = replayed | {"level": "re-run", "rerun": {"value": "beef"}}
+
+    def recorded(machine, facts):
+        monkeypatch.setattr(processor, "processor", lambda: machine)
+        _record(path, facts)
+        return json.loads(path.read_text())
+
+    assert recorded("A", replayed) == replayed | {"machines": ["A"]}
+    assert recorded("B", rerun) == rerun | {"machines": ["A", "B"]}
+    assert recorded("C", replayed) == rerun | {"machines": ["A", "B", "C"]}, "a replay does not undo a re-run"
+    newer = {"versions": {"sapien": "4"}}
+    assert recorded("D", replayed | newer) == rerun | newer | {"machines": ["D"]}
+    other = replayed | {"submission": "1" * 64}
+    assert recorded("E", other) == other | {"machines": ["E"]}
+
+
+def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypatch):
+    class Still:
+        """Stands in for a simulator: an episode that never ends."""
+
+        def reset(self, seed): ...
+        def close(self): ...
+
+        def render(self):
+            return np.zeros((64, 64, 3), np.uint8)
+
+        def step(self, action):
+            return None, 0.0, False, False, {}
+
+    lengths = []
+    monkeypatch.setattr(films, "open_simulator", lambda *_: Still())
+    monkeypatch.setattr(films, "write_video", lambda path, frames, fps: lengths.append(len(frames)) or path.touch())
+    setting = Setting("brick_to_bin", episode_length=2 * HORIZON)
+    claim = Claim(0, steps=2 * HORIZON, actions=np.zeros(8 * HORIZON, np.float32))
+    films._film(setting, claim, tmp_path / "film.mp4")
+    assert lengths == [HORIZON + 1] and (tmp_path / "film.mp4").exists()
 
 
 def test_rewards_are_those_of_the_environment():

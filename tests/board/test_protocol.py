@@ -49,7 +49,7 @@ def test_the_pages_table_is_the_protocol():
 
 
 def test_the_page_names_the_other_numbers():
-    assert f"Training seeds** are 0 to {TRAINING_SEEDS - 1}." in PAGE
+    assert f"Training seeds** are 0 to {TRAINING_SEEDS[-1]}." in PAGE
     assert f"each alone at level {LEVEL}, draw 0" in PAGE and f"`{PERTURBED_TASK}` as it is" in PAGE
     assert f"({', '.join(STAGES)})" in PAGE
     assert all(f"| {level} |" in PAGE for level in LEVELS)
@@ -66,13 +66,14 @@ def test_a_perturbed_setting_has_its_control():
 
 def test_whoever_changes_a_setting_is_custom():
     settings = SUITES["bins"].settings
-    assert class_of("bins", dict(settings)) == "standard"
+    assert class_of("bins", dict(settings), [0, 3, 9]) == "standard"
     for changed in (
         {},
         {**settings, "more": Setting("brick_to_bin")},
         {**settings, "block_to_bin": Setting("brick_to_bin")},
     ):
-        assert class_of("bins", changed) == "custom"
+        assert class_of("bins", changed, TRAINING_SEEDS) == "custom"
+    assert class_of("bins", dict(settings), [0, 3, 10]) == "custom", "chosen seeds"
 
 
 @pytest.mark.parametrize("wrong", [{"task": "x"}, {"episodes": 0}, {"perturb": "rain=1"}, {"first_start": 2**31 - 5}])

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
-from lerobot_constructskill.board.protocol import fresh_settings, fresh_start
-from lerobot_constructskill.board.rerun import compare
+from lerobot_constructskill.board.protocol import Setting, fresh_settings, fresh_start
+from lerobot_constructskill.board.rerun import compare, instructions
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission
 from lerobot_constructskill.errors import InputError
 
@@ -44,6 +45,19 @@ def test_what_only_works_on_public_starts_is_not_confirmed(submission):
     assert all(one.submitted == 1.0 and one.again < 1.0 for one in worse.rates)
     with pytest.raises(InputError, match=r"does not confirm it: .* 100% submitted, .* run anew \(p = "):
         worse.confirm()
+
+
+def test_seeds_are_the_same_in_any_order_and_a_draw_is_told(submission):
+    again = rerun(submission, 1.0)
+    seeds = replace(again.declaration, training_seeds=again.declaration.training_seeds[::-1])
+    compare(submission, replace(again, declaration=seeds), VALUE).confirm()
+    with pytest.raises(InputError, match="training seeds"):
+        compare(submission, replace(again, declaration=replace(seeds, training_seeds=[0])), VALUE)
+    settings = {"on": Setting("block_to_bin", perturb_seed=5)}
+    told = instructions(replace(submission, declaration=replace(submission.declaration, settings=settings)), VALUE)
+    (said,) = [yaml.safe_load(line) for line in told.splitlines() if line.startswith("'on'")]
+    first = fresh_start(submission.sha256, VALUE)
+    assert {name: Setting(**of) for name, of in said.items()} == fresh_settings(settings, first)
 
 
 def test_better_on_fresh_starts_is_confirmed(submission):

@@ -81,4 +81,5 @@ def test_levels_that_do_not_exist_are_refused(bad, word):
 def test_results_are_kept_under_the_perturbations_name():
     config = ConstructSkillEnvConfig(task="joints", perturb="camera=2,light=0,sensor=1", perturb_seed=3)
     assert list(config.create_envs(n_envs=1)) == ["joints+camera=2+sensor=1+seed=3"]
-    assert Perturbation("light=0").label == ""
+    assert Perturbation("light=0").label == Perturbation("light=00").label == ""
+    assert Perturbation(" light=1, camera=02").label == Perturbation("camera=2,light=1").label
