@@ -30,6 +30,8 @@ def cores() -> int:
 def open_pool(executor: str, workers: int) -> Iterator[Submit]:
     """Yield `submit(function, *arguments) -> Future`; leaving waits for what still runs.
 
+    If the block raises, what has not begun is dropped.
+
     Raises:
         OSError: a worker process died.
         ValueError: `ray` was asked for and is not installed.
@@ -58,7 +60,11 @@ def _inline() -> Iterator[Submit]:
 def _processes(workers: int) -> Iterator[Submit]:
     try:
         with ProcessPoolExecutor(workers, get_context("spawn"), initializer=_settle) as pool:
-            yield pool.submit
+            try:
+                yield pool.submit
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
     except BrokenExecutor:
         raise MachineError(DIED) from None
 

@@ -43,7 +43,8 @@ def obtain_data(plan: Plan, number: int, store: Store) -> LeRobotDataset:
 
 def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, store: Store) -> None:
     base, *rounds = parts
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+    # The disk's room is measured before the scratch folder is gone.
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):
         first = Path(scratch) / "demonstrations"
         _add_columns(plan, base, first)
         aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))

@@ -18,7 +18,7 @@ from lerobot_constructskill.dagger.wheel import Drive, Episode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.merge import aggregate
-from lerobot_constructskill.demos.shards import EPISODE, write_episode
+from lerobot_constructskill.demos.shards import EPISODE, whole, write_episode
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.agents import PolicyAgent
@@ -82,7 +82,7 @@ def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpiso
 
 def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Store) -> None:
     shards = folder.with_name(SHARDS)
-    finished = {outcome.seed for path in shards.glob(f"*/{OUTCOME}") for outcome in _read(path)}
+    finished = {outcome.seed for outcome in whole(shards, OUTCOME, _read_one)}
     seeds = [seed for seed in plan.seeds(number) if seed not in finished]
     features = dagger_features(plan.task, plan.base.obs_type)
     drive = Drive(number, plan.config.beta(number), plan.config.patience)
@@ -117,6 +117,11 @@ def _save(outcomes: Iterable[DrivenEpisode], path: Path) -> None:
 
 def _read(path: Path) -> list[DrivenEpisode]:
     return [DrivenEpisode(**fields) for fields in json.loads(path.read_text())]
+
+
+def _read_one(path: Path) -> DrivenEpisode:
+    (outcome,) = _read(path)
+    return outcome
 
 
 def totals(outcomes: Iterable[DrivenEpisode]) -> Mapping[str, Any]:

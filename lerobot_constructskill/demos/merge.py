@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.hashes import file_hashes
@@ -31,8 +32,14 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
             "Some attempts drew the light robot and some the full one, on machines with and without a GPU: "
             "set --light_robot and generate all of them again."
         )
+    if len(backends := {attempt.backend for attempt in attempts}) > 1:
+        raise InputError(
+            f"Some attempts were made by {' and some by '.join(sorted(backends))}: remove {shards} and generate all "
+            "of them on machines of one kind."
+        )
     roots = [shards / str(attempt.seed) / EPISODE for attempt in attempts if attempt.success]
-    with tempfile.TemporaryDirectory(dir=shards) as scratch:
+    # The disk's room is measured before the scratch folder is gone.
+    with tempfile.TemporaryDirectory(dir=shards) as scratch, room_for(folder):
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
     task = get_task(config.task)

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -31,12 +32,14 @@ class Attempt:
         success: whether the object was placed.
         frames: steps taken.
         light_robot: how the robot was drawn where the attempt ran.
+        backend: what simulated and rendered it.
     """
 
     seed: int
     success: bool
     frames: int
     light_robot: bool
+    backend: str
 
 
 def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
@@ -50,8 +53,7 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     expert = make_expert(task, config.expert)
     env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot)
     frames, success = demonstrate(env, expert, config.noise, seed, config.labels, config.stop_at_success)
-    light_robot = env.light_robot
-    outcome = Attempt(seed, success, len(frames), light_robot)
+    outcome = Attempt(seed, success, len(frames), env.light_robot, env.backend)
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
         with room_for(shard):
@@ -70,17 +72,22 @@ def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | N
 
 def finished(folder: Path) -> dict[int, Attempt]:
     """The attempts whose shards lie in `folder`, by seed."""
-    outcomes = [_read(path) for path in sorted(folder.glob(f"*/{OUTCOME}"))]
-    return {outcome.seed: outcome for outcome in outcomes if outcome}
+    outcomes = whole(folder, OUTCOME, lambda path: Attempt(**json.loads(path.read_text())))
+    return {outcome.seed: outcome for outcome in outcomes}
 
 
-def _read(path: Path) -> Attempt | None:
-    """A finished attempt; None where a power cut left a file without its content, and its shard is then removed."""
-    try:
-        return Attempt(**json.loads(path.read_text()))
-    except (ValueError, TypeError):
-        shutil.rmtree(path.parent)
-        return None
+def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> list[Kind]:
+    """What `read` makes of the outcome of each shard in `folder`.
+
+    A shard whose outcome a power cut left without its content, or another version wrote, is removed.
+    """
+    found = []
+    for path in sorted(folder.glob(f"*/{outcome}")):
+        try:
+            found.append(read(path))
+        except (ValueError, TypeError):
+            shutil.rmtree(path.parent)
+    return found
 
 
 def write_episode(

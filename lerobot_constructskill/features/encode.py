@@ -117,11 +117,11 @@ def join_feature_sets(
 def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
     """Write the rows of several files of patch features, one open at a time, into one of so many frames."""
     shape = (frames, *np.load(files[0], mmap_mode="r").shape[1:])
-    out, first = np.lib.format.open_memmap(joined, "w+", dtype=np.float16, shape=shape), 0
-    for file in files:
-        rows = np.load(file, mmap_mode="r")
-        out[first : first + len(rows)] = rows
-        first += len(rows)
+    header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float16)), "fortran_order": False, "shape": shape}
+    with joined.open("wb") as out:  # a full disk raises here; under a memory map it would kill the process
+        np.lib.format.write_array_header_1_0(out, header)
+        for file in files:
+            out.write(np.load(file, mmap_mode="r"))
 
 
 def _with_source(info: dict[str, str], dataset: LeRobotDataset) -> dict[str, str]:

@@ -63,11 +63,13 @@ class FeatureTrainer:
                 joined = of_parts, info, f"local/{made.digest}"
                 with store.writing(made) as folder:
                     join_feature_sets(whole, config.camera, *joined, folder, made.spec["patches"])
-        yield
-        close_patches()
-        with store.claim([made]) as missing:
-            if not missing:
-                store.discard(made)
+        try:
+            yield
+        finally:
+            close_patches()
+            with store.claim([made]) as missing:
+                if not missing:
+                    store.discard(made)
 
     def fit(
         self,

@@ -22,6 +22,9 @@ PRELOADED = [
 """Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
 
 
+DIED = "A simulator's process died; if there was not enough memory, run fewer at once."
+
+
 @dataclass(frozen=True)
 class Step:
     """What an environment returned from `reset` or `step`, with its privileged state and its proprioception."""
@@ -61,11 +64,14 @@ class Simulators:
         for number, argument in arguments.items():
             shares[number % len(shares)][number] = argument
         asked = [(worker, share) for worker, share in zip(self._workers, shares, strict=True) if share]
-        for worker, share in asked:
-            worker.send((verb, share))
         answers: dict[int, Any] = {}
-        for worker, _ in asked:
-            answers |= _receive(worker)
+        try:
+            for worker, share in asked:
+                worker.send((verb, share))
+            for worker, _ in asked:
+                answers |= worker.recv()
+        except (EOFError, ConnectionError):
+            raise MachineError(DIED) from None
         return answers
 
 
@@ -91,13 +97,6 @@ def simulators(env_kwargs: Sequence[Mapping[str, Any]], n_workers: int | None = 
         for process in processes:
             process.join(timeout=10)
             process.kill()
-
-
-def _receive(worker: Connection) -> dict[int, Any]:
-    try:
-        return worker.recv()
-    except (EOFError, ConnectionError):
-        raise MachineError("A simulator's process died; if there was not enough memory, run fewer at once.") from None
 
 
 def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> None:

@@ -48,8 +48,10 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
             if run in chosen:
                 table.forget_failure(run)
         missing = [run for run in chosen if table.episodes(run) is None]
-        with store.claim([run.artifact for run in chosen if run not in missing]):
-            pass  # which tidies up after a process that was killed when one of them was whole
+        for run in chosen:
+            if run not in missing:
+                with store.claim([run.artifact]):  # one by one: each holds a file open
+                    pass  # which tidies up after a process that was killed when it was whole
         table.write()
         earlier, start = _provenance(root), time.monotonic()
         with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:

@@ -1,6 +1,7 @@
 """A study as a file: what is trained on what, with which seeds, and where it is evaluated."""
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -114,6 +115,13 @@ class Study:
                 raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; the settings are: {known}.")
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
+
+        films = Counter(f"{setting}-{name}" for setting in self.settings for name in self._agents_in(setting))
+        if same := [name for name, count in films.items() if count > 1]:
+            raise InputError(f"Two settings and variants are both '{same[0]}' when joined; rename one of them.")
+
+    def _agents_in(self, setting: str) -> list[str]:
+        return [*self.variants_in(setting), *self.references]
 
     def variants_in(self, setting: str) -> dict[str, Variant]:
         """The variants that run in a setting, by name."""

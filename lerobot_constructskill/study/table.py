@@ -23,6 +23,9 @@ from lerobot_constructskill.training.checkpoints import read_facts
 
 VIDEOS = "videos"
 
+HELDOUT = ("heldout_mse_m2", "heldout_mse_m2_by_data")
+"""Columns of `Row` that follow from a run's checkpoint: on the setting's own demonstrations, and on each by name."""
+
 
 class Table:
     """The rows of a study's runs, in the study's order; what has been read is kept.
@@ -101,19 +104,24 @@ class Table:
         if run.artifact.digest not in self._made:
             yield from (replace(row, **_names(run)) for row in self.episodes(run))
             return
-        common, errors = _names(run), self._heldout_errors(run)
-        if errors:
-            common |= {"heldout_mse_m2": errors.get(run.arm.validated_on[0].name)}
-            common |= {"heldout_mse_m2_by_data": json.dumps(errors)}
+        common = _names(run) | self._heldout_errors(run)
         for row in self.episodes(run):
             yield Row(**asdict(row), **common, video=self._video(run) if row.episode == 0 else None)
 
-    def _heldout_errors(self, run: Run) -> dict[str, float | None]:
-        """The run's error on what is held out of all demonstrations of its setting, by their names."""
-        if run.checkpoint is None or not self.store.has(run.checkpoint):
+    def _heldout_errors(self, run: Run) -> dict[str, Any]:
+        """The run's error on what is held out of all demonstrations of its setting, as two columns of its rows.
+
+        They are those of the table in the folder where the checkpoint has been removed since.
+        """
+        if run.checkpoint is None:
             return {}
+        if not self.store.has(run.checkpoint):
+            kept = next((rows[0] for key in _keys(run) if (rows := self._kept.get(key))), None)
+            return {name: getattr(kept, name) for name in HELDOUT} if kept else {}
         errors = {data.name: self._heldout_error(run, data) for data in run.arm.validated_on}
-        return {name: error for name, error in errors.items() if error is not None}
+        errors = {name: error for name, error in errors.items() if error is not None}
+        own, every = HELDOUT
+        return {own: errors.get(run.arm.validated_on[0].name), every: json.dumps(errors)} if errors else {}
 
     def _heldout_error(self, run: Run, data: Demonstrations) -> float | None:
         if data == run.arm.demonstrations:

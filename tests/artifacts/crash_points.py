@@ -117,7 +117,7 @@ def scenario_generate(root: Path) -> None:
         return rng.integers(0, 2, feature["shape"]).astype(feature["dtype"])
 
     shards.demonstrate = demonstrate
-    shards._environment = lambda *_: type("Env", (), {"light_robot": True})()
+    shards._environment = lambda *_: type("Env", (), {"light_robot": True, "backend": "none"})()
     with suppress(TakenError):
         record(GenerateConfig("local/set", str(root / "set"), episodes=2))
 

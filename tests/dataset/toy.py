@@ -20,7 +20,7 @@ BIN = np.array([0.0, -0.35, 0.08], dtype=np.float32)
 class ToyEnv:
     """`ConstructSkillEnv` as far as a recorder uses it; seed 1000002 never succeeds."""
 
-    light_robot = True
+    light_robot, backend = True, "none"
 
     def __init__(self, task, obs_type, episode_length, light_robot=None):
         self.cameras, self.episode_length = OBS_TYPES[obs_type], episode_length

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_constructskill.artifacts import disk
-from lerobot_constructskill.demos import recorder, shards
+from lerobot_constructskill.demos import merge, recorder, shards
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
@@ -31,7 +31,7 @@ def attempted(monkeypatch):
     def attempt(config, seed, folder):
         time.sleep(random.random() / 100)
         seeds.append(seed)
-        return Attempt(seed, seed not in FAILS, 10, True)
+        return Attempt(seed, seed not in FAILS, 10, True, "cpu")
 
     @contextmanager
     def threads(executor, workers):
@@ -54,7 +54,9 @@ def test_the_first_successes_in_the_order_of_seeds_are_taken_whatever_the_worker
 def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, attempted, tmp_path):
     for seed in (1, 4, 7, 50):
         (tmp_path / str(seed)).mkdir()
-        (tmp_path / str(seed) / shards.OUTCOME).write_text(json.dumps(asdict(Attempt(seed, seed != 4, 10, True))))
+        (tmp_path / str(seed) / shards.OUTCOME).write_text(
+            json.dumps(asdict(Attempt(seed, seed != 4, 10, True, "cpu")))
+        )
     (tmp_path / "5.partial" / "dataset").mkdir(parents=True)
     (tmp_path / "5.partial" / "dataset" / shards.OUTCOME).touch()
     attempts = recorder._run_attempts(replace(CONFIG, workers=workers), tmp_path)
@@ -92,10 +94,12 @@ def test_a_disk_that_is_too_small_is_told_before_anything_is_written(monkeypatch
 
 
 def test_machines_that_draw_the_robot_differently_are_not_mixed(tmp_path):
-    from lerobot_constructskill.demos.merge import merge
-
-    with pytest.raises(ValueError, match="light_robot"):
-        merge(CONFIG, [Attempt(0, True, 10, True), Attempt(1, True, 10, False)], tmp_path, tmp_path / "set")
+    for other, said in (
+        (Attempt(1, True, 10, False, "cpu"), "light_robot"),
+        (Attempt(1, True, 10, True, "gpu"), "some"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            merge.merge(CONFIG, [Attempt(0, True, 10, True, "cpu"), other], tmp_path, tmp_path / "set")
 
 
 @pytest.mark.parametrize("content", ["", "[]", "null", '{"seed": 1}'])
@@ -116,3 +120,17 @@ def test_a_full_disk_is_said_in_one_sentence(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(RuntimeError), disk.room_for(tmp_path):
         raise RuntimeError("a fault of ours")
+
+
+def test_a_disk_that_scratch_files_fill_is_measured_before_they_are_gone(tmp_path, monkeypatch):
+    """Stands in for LeRobot's aggregation and for the disk: a real one would have to be filled."""
+
+    def aggregate(repo_id, roots, folder, scratch):
+        (scratch / "large").touch()
+        raise RuntimeError("Encoder thread failed")
+
+    usage = lambda path: SimpleNamespace(free=0 if list(tmp_path.rglob("large")) else 10**9)  # noqa: E731
+    monkeypatch.setattr(merge, "aggregate", aggregate)
+    monkeypatch.setattr(disk.shutil, "disk_usage", usage)
+    with pytest.raises(MachineError, match="is full"):
+        merge.merge(CONFIG, [Attempt(0, True, 10, True, "cpu")], tmp_path, tmp_path / "set")

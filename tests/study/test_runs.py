@@ -1,5 +1,7 @@
 """What a study's runs depend on, and what they do not: found without running any of them."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
 from lerobot_constructskill.study.validate import list_pairs
+from lerobot_constructskill.training.checkpoints import FACTS
 from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
@@ -279,6 +282,20 @@ def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_pa
         assert not table.missing() and not table.lost()
 
 
+def test_held_out_errors_outlive_the_checkpoint_that_they_are_of(tmp_path):
+    table = make_all(study(), tmp_path)
+    run = next(run for run in table.runs if run.checkpoint)
+    with table.store.writing(run.checkpoint) as folder:
+        folder.mkdir()
+        (folder / FACTS).write_text(json.dumps({"heldout_mse_m2": 1e-5}))
+    Table(tmp_path / "x", table.runs, table.store).write()
+    before = read_rows(tmp_path / "x" / "rows.parquet")
+    assert set(before["heldout_mse_m2"].dropna()) == {1e-5}
+    shutil.rmtree(table.store.folder(run.checkpoint))
+    Table(tmp_path / "x", table.runs, table.store).write()
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), before)
+
+
 def test_no_row_is_lost_that_is_nowhere_else(tmp_path):
     table = make_all(study(), tmp_path)
     fewer, empty = study(variants={"a": study().variants["a"]}), Store(tmp_path / "elsewhere")
@@ -346,6 +363,13 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"variants": {}}, "at least one of variants"),
         ({"variants": {"a b": Variant(ACT)}}, "'a b' cannot name"),
         ({"variants": {"no_op": Variant(ACT)}}, "name of two things"),
+        (
+            {
+                "settings": {"fixed": Setting("smoke"), "fixed-a": Setting("smoke")},
+                "variants": {"a-b": Variant(ACT), "b": Variant(ACT)},
+            },
+            "both 'fixed-a-b' when joined",
+        ),
         ({"variants": {"a": Variant({})}}, "must name its policy's type"),
         ({"variants": {"a": Variant({"type": "pi9"})}}, "variants.a.policy: .*pi9"),
         ({"variants": {"a": Variant(ACT | {"chunk_sise": 5})}}, "variants.a.policy: .*chunk_sise"),
