@@ -31,7 +31,7 @@ def find_chromium() -> str | None:
     return None
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it is open, its event loop runs, which others of a session would meet
 def browser():
     playwright, chromium = pytest.importorskip("playwright.sync_api"), find_chromium()
     if chromium is None:
