@@ -11,7 +11,7 @@ from lerobot_constructskill.board.protocol import Setting
 from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_rows
 
 SEED = r"seed_(\d{1,9})"
 
@@ -43,9 +43,7 @@ def of_study(root: Path, store: Path, variant: str, tasks: Collection[str]) -> t
         MissingError: the study, or what one of its runs executed, is not there.
         InputError: the study has no such variant, or not in a setting with one of the tasks.
     """
-    for name in (STUDY, ROWS):
-        if not (root / name).is_file():
-            raise MissingError(f"'{root}' is not the folder of a study: {name} is missing.")
+    check_folder(root)
     rows = read_rows(root / ROWS)
     own = rows[rows["variant"] == variant]
     if own.empty:

@@ -88,7 +88,7 @@ def instructions(submission: Submission, value: str) -> str:
 
 
 def _is_drawn(setting: Setting) -> bool:
-    """Whether its perturbation is other than the default's."""
+    """Whether it names a perturbation or a draw, which a re-run's settings have to repeat."""
     return bool(setting.perturb or setting.perturb_seed)
 
 

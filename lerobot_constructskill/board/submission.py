@@ -225,7 +225,7 @@ def write_submission(root: Path, claims: Iterable[Claim], **declared: Any) -> Su
         TakenError: the folder exists.
         InputError: it would be refused.
     """
-    unhashed = Declaration(**declared, episodes_sha256="0" * 64)
+    unhashed = Declaration(**declared, episodes_sha256="0" * 64)  # refuses what is wrong before anything is written
     with staged(root) as folder:
         folder.mkdir()
         columns = [vars(claim) for claim in claims]

@@ -80,7 +80,10 @@ def generator_facts(config: GenerateConfig) -> dict[str, Any]:
 
 
 def frames_digest(config: GenerateConfig) -> str:
-    """Digest of everything that a frame depends on, so that shards of two settings never meet in one data set."""
+    """Digest of all settings and versions that a frame depends on, so that shards of two never meet in one data set.
+
+    What rendered a shard is known when it is there: `merge` refuses a mixture.
+    """
     facts = generator_facts(config)
     for name in ("repo_id", "episodes", "max_failures", "seed_start"):
         del facts[name]

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MissingError
 
 STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
 """Files in a study's folder: the study as it was read, its rows, and what is known of how they were made."""
@@ -23,6 +23,17 @@ VARIANT, REFERENCE, SIGHTLESS = "variant", "reference", "sightless"
 
 NOT_RUN = "not_run"
 """`error_kind` of a run that has not been made; any other kind is that of an exception (`errors.kind`)."""
+
+
+def check_folder(root: Path) -> None:
+    """Refuse what is not the folder of a study.
+
+    Raises:
+        MissingError: its file or its rows are not there.
+    """
+    for name in (STUDY, ROWS):
+        if not (root / name).is_file():
+            raise MissingError(f"'{root}' is not the folder of a study: {name} is missing.")
 
 
 @dataclass(frozen=True, kw_only=True)

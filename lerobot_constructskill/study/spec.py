@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
@@ -116,12 +117,12 @@ class Study:
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
 
-        films = Counter(f"{setting}-{name}" for setting in self.settings for name in self._agents_in(setting))
-        if same := [name for name, count in films.items() if count > 1]:
+        agents = [
+            (setting, name) for setting in self.settings for name in (*self.variants_in(setting), *self.references)
+        ]
+        videos = Counter(video_path(*agent).stem for agent in agents)
+        if same := [name for name, count in videos.items() if count > 1]:
             raise InputError(f"Two settings and variants are both '{same[0]}' when joined; rename one of them.")
-
-    def _agents_in(self, setting: str) -> list[str]:
-        return [*self.variants_in(setting), *self.references]
 
     def variants_in(self, setting: str) -> dict[str, Variant]:
         """The variants that run in a setting, by name."""
@@ -140,6 +141,11 @@ class Study:
         """
         data = (self.data_for(setting, variant) for variant in self.variants_in(setting).values())
         return list(dict.fromkeys([self.settings[setting].data, *data]))
+
+
+def video_path(setting: str, name: str) -> Path:
+    """Where the video of a variant or reference in a setting lies in a study's folder."""
+    return Path("videos") / f"{setting}-{name}.mp4"
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,9 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
+from lerobot_constructskill.study.spec import video_path
 from lerobot_constructskill.study.validate import read_error
 from lerobot_constructskill.training.checkpoints import read_facts
-
-VIDEOS = "videos"
 
 HELDOUT = ("heldout_mse_m2", "heldout_mse_m2_by_data")
 """Columns of `Row` that follow from a run's checkpoint: on the setting's own demonstrations, and on each by name."""
@@ -61,7 +60,11 @@ class Table:
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
-        return self._made.get(name) or next((rows for key in _keys(run) if (rows := self._kept.get(key))), None)
+        return self._made.get(name) or self._kept_rows(run)
+
+    def _kept_rows(self, run: Run) -> list[Row] | None:
+        """The rows of a run that the table in the folder had, if it ran to its end."""
+        return next((rows for key in _keys(run) if (rows := self._kept.get(key))), None)
 
     def lost(self) -> list[str]:
         """The finished runs of the table in the folder that neither this study nor the store has."""
@@ -116,8 +119,8 @@ class Table:
         if run.checkpoint is None:
             return {}
         if not self.store.has(run.checkpoint):
-            kept = next((rows[0] for key in _keys(run) if (rows := self._kept.get(key))), None)
-            return {name: getattr(kept, name) for name in HELDOUT} if kept else {}
+            kept = self._kept_rows(run)
+            return {name: getattr(kept[0], name) for name in HELDOUT} if kept else {}
         errors = {data.name: self._heldout_error(run, data) for data in run.arm.validated_on}
         errors = {name: error for name, error in errors.items() if error is not None}
         own, every = HELDOUT
@@ -133,7 +136,7 @@ class Table:
         video = self.store.folder(run.artifact) / VIDEO
         if run.seed != FILMED_SEED or not video.exists():
             return None
-        path = Path(VIDEOS) / f"{run.arm.setting}-{run.arm.name}.mp4"
+        path = video_path(run.arm.setting, run.arm.name)
         if not (self.root / path).exists() or (self.root / path).stat().st_mtime != video.stat().st_mtime:
             with replaced(self.root / path) as partial:
                 shutil.copy2(video, partial)

@@ -21,8 +21,8 @@ from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
 from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.power import seeds_needed, wrong_order
-from lerobot_constructskill.errors import InputError, MissingError, plural
-from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, read_rows
+from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, check_folder, read_rows
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -83,9 +83,7 @@ def write_report(root: Path) -> Path:
 
 def read_study(root: Path) -> tuple[Heading, pd.DataFrame]:
     """Read what a report takes of a study's file, and its rows. Raises as `write_report` does."""
-    for name in (STUDY, ROWS):
-        if not (root / name).is_file():
-            raise MissingError(f"'{root}' is not the folder of a study: {name} is missing.")
+    check_folder(root)
     return _read_heading(root / STUDY), read_rows(root / ROWS)
 
 
