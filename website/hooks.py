@@ -7,6 +7,7 @@ that are made of the code: of each task, of the commands and of the Python inter
 import os
 import re
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 
 import reference
@@ -36,7 +37,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {**task_pages.pages(ROOT), **reference.pages(ROOT)}
     made |= {shown(path): source_page(path) for path in linked if is_source(path)}
     theirs = [file for file in files if file.src_dir != config.docs_dir and not UNUSED.search(file.src_uri)]
-    ours = [_file(uri(path), ROOT, config) for path in linked if not is_source(path)]
+    copies.cache_clear()  # mkdocs serve builds again
+    twins = copies()
+    ours = [_file(uri(path), ROOT, config) for path in linked if not is_source(path) and path not in twins]
     ours += [_file(uri(path), ASSETS.parent, config) for path in sorted(ASSETS.iterdir())]
     ours += [_file(uri(path), ROOT, config) for path in sorted(ROOT.glob("docs/films/*")) if path not in linked]
     ours += [File.generated(config, name, content=text) for name, text in made.items()]
@@ -45,11 +48,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, **_) -> str:
-    """Lead links to folders and sources to the pages that show them, and a task's name to its page."""
+    """Lead links to folders and sources to the pages that show them, to a copy to its original, a task to its page."""
     folder = (ROOT / page.file.src_uri).parent
+    twins = copies()
 
     def lead(match: re.Match) -> str:
         path = Path(os.path.normpath(folder / match[0]))
+        if path in twins:
+            return Path(os.path.relpath(twins[path], folder)).as_posix()
         return f"{match[0].rstrip('/')}.md" if path.exists() and is_source(path) else match[0]
 
     markdown = LINK.sub(lead, markdown)
@@ -67,6 +73,17 @@ def reached(pages: list[Path]) -> list[Path]:
         found |= dict.fromkeys(new)
         waiting += [path for path in new if path.suffix == ".md"]
     return list(found)
+
+
+@cache
+def copies() -> dict[Path, Path]:
+    """Media with the bytes of another file, to the first such file: studies share runs, and so their films."""
+    first, twins = {}, {}
+    for path in reached(CHAPTERS):
+        if path.suffix in MEDIA:
+            original = first.setdefault(path.read_bytes(), path)
+            twins |= {path: original} if original != path else {}
+    return twins
 
 
 def is_source(path: Path) -> bool:
