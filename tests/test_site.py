@@ -97,6 +97,11 @@ def test_the_site_is_small(site):
     assert sum(file.stat().st_size for file in site.rglob("*") if file.is_file()) < LARGEST
 
 
+def test_no_picture_or_film_is_there_twice(site):
+    media = [file for file in site.rglob("*") if file.suffix in {".png", ".jpg", ".mp4"}]
+    assert len({file.read_bytes() for file in media}) == len(media)
+
+
 def test_every_chapter_and_task_has_its_page(site):
     chapters = [site / page.relative_to(ROOT).with_suffix(".html") for page in PAGES[1:]]
     tasks = [site / "docs" / "tasks" / f"{task}.html" for task in TASKS]
