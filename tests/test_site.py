@@ -98,7 +98,7 @@ def test_the_site_is_small(site):
 
 
 def test_no_picture_or_film_is_there_twice(site):
-    media = [file for file in site.rglob("*") if file.suffix in {".png", ".jpg", ".mp4"}]
+    media = [file for file in site.rglob("*") if file.suffix in {".png", ".jpg", ".mp4", ".parquet"}]
     assert len({file.read_bytes() for file in media}) == len(media)
 
 

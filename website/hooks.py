@@ -7,7 +7,6 @@ that are made of the code: of each task, of the commands and of the Python inter
 import os
 import re
 from fnmatch import fnmatch
-from functools import cache
 from pathlib import Path
 
 import reference
@@ -37,8 +36,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {**task_pages.pages(ROOT), **reference.pages(ROOT)}
     made |= {shown(path): source_page(path) for path in linked if is_source(path)}
     theirs = [file for file in files if file.src_dir != config.docs_dir and not UNUSED.search(file.src_uri)]
-    copies.cache_clear()  # mkdocs serve builds again
-    twins = copies()
+    twins = config.extra["copies"] = copies(linked)
     ours = [_file(uri(path), ROOT, config) for path in linked if not is_source(path) and path not in twins]
     ours += [_file(uri(path), ASSETS.parent, config) for path in sorted(ASSETS.iterdir())]
     ours += [_file(uri(path), ROOT, config) for path in sorted(ROOT.glob("docs/films/*")) if path not in linked]
@@ -47,10 +45,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return Files([*theirs, *ours])
 
 
-def on_page_markdown(markdown: str, page: Page, **_) -> str:
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_) -> str:
     """Lead links to folders and sources to the pages that show them, to a copy to its original, a task to its page."""
     folder = (ROOT / page.file.src_uri).parent
-    twins = copies()
+    twins = config.extra["copies"]
 
     def lead(match: re.Match) -> str:
         path = Path(os.path.normpath(folder / match[0]))
@@ -75,15 +73,11 @@ def reached(pages: list[Path]) -> list[Path]:
     return list(found)
 
 
-@cache
-def copies() -> dict[Path, Path]:
-    """Media with the bytes of another file, to the first such file: studies share runs, and so their films."""
-    first, twins = {}, {}
-    for path in reached(CHAPTERS):
-        if path.suffix in MEDIA:
-            original = first.setdefault(path.read_bytes(), path)
-            twins |= {path: original} if original != path else {}
-    return twins
+def copies(paths: list[Path]) -> dict[Path, Path]:
+    """Media with the bytes of one before them, to that one: studies share runs, and so their films."""
+    first: dict[bytes, Path] = {}
+    originals = {path: first.setdefault(path.read_bytes(), path) for path in paths if path.suffix in MEDIA}
+    return {path: original for path, original in originals.items() if path != original}
 
 
 def is_source(path: Path) -> bool:
