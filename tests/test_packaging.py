@@ -62,6 +62,7 @@ print(json.dumps([imported, list(PreTrainedConfig.get_known_choices()), list(Env
 """
 
 
+@pytest.mark.slow
 def test_plugin_registers_without_simulator_or_model() -> None:
     imported, policies, envs = json.loads(run_python(REGISTER).splitlines()[-1])
     assert "frozen_vit" in policies

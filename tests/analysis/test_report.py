@@ -60,6 +60,7 @@ def no_figures(monkeypatch):
     monkeypatch.setattr(ink, "encoded", lambda drawing, paper, *formats: [b""] * len(formats))
 
 
+@pytest.mark.slow
 def test_page_holds_the_papers_tables_and_every_figure(study):
     reader = Reader((study / "report.html").read_text())
     text = re.sub(r"\s+", " ", " ".join(reader.text))
@@ -167,6 +168,7 @@ def test_what_a_setting_is_read_with_comes_from_the_rows(findings):
     assert (fixed.declared, moved.declared) == (6 + 1, 3 + 1)
 
 
+@pytest.mark.slow
 def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_figures):
     """Not even one by resampling."""
     root = write_study(tmp_path)
@@ -213,6 +215,7 @@ ONE_VARIANT = STUDY | {"variants": {"dinov2": {"seeds": 10}}, "analysis": {}}
 
 
 @pytest.mark.parametrize("study, sections", [(STUDY, ["fixed", "moved"]), (ONE_VARIANT, ["fixed"])])
+@pytest.mark.slow
 def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_nothing(study, sections, tmp_path):
     names = [*study["variants"], *study["references"]]
     findings = findings_of(study, study_rows(study), tmp_path, sweeps={"position": ["fixed", "moved"]})
@@ -275,6 +278,7 @@ def test_an_analysis_that_does_not_fit_is_refused_in_a_sentence(analysis, said, 
         report(ReportConfig(write_study(tmp_path, SMALL, missing_rows(SMALL), **analysis)))
 
 
+@pytest.mark.slow
 def test_report_is_the_same_twice(tmp_path):
     rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, 1, run[2])]
     root = write_study(tmp_path, SMALL, rows)
@@ -366,6 +370,7 @@ print({{"torch", "lerobot", "sapien", "mani_skill"}} & set(sys.modules))
 """
 
 
+@pytest.mark.slow
 def test_command_imports_neither_torch_nor_lerobot_nor_simulator(tmp_path):
     write_study(tmp_path, SMALL, missing_rows(SMALL))
     code = COMMAND.format(root=tmp_path)

@@ -65,6 +65,7 @@ def test_better_on_fresh_starts_is_confirmed(submission):
     compare(weak, rerun(submission, 1.0), VALUE).confirm()
 
 
+@pytest.mark.slow
 def test_an_honest_submission_is_hardly_ever_refused(submission):
     refused = 0
     for seed in range(50):

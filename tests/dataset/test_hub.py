@@ -148,6 +148,7 @@ def test_a_push_killed_at_any_request_is_finished_by_the_same_command(update, af
     assert number >= 8
 
 
+@pytest.mark.slow
 def test_a_whole_data_set_is_replaced_only_where_that_is_asked_for(hub, machine, pristine, copy):
     machine(push, pristine, "alice/twice")
     first = hub.repos["datasets/alice/twice"].tags["v3.0"]

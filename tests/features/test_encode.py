@@ -132,6 +132,7 @@ def test_features_are_the_policys_own_at_every_frame(source, encoded, weights):
         torch.testing.assert_close(after[KEY], feature, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_patch_features_on_request(source, weights, tmp_path):
     encode(settings(source, weights, tmp_path / "out", patches=True))
     patches = np.load(tmp_path / "out" / PATCHES_FILE, mmap_mode="r")
@@ -161,6 +162,7 @@ def test_the_policy_trains_on_features_and_declares_the_camera(encoded, weights)
     assert batch[KEY].shape == (4, 192) and batch["action_is_pad"].any() and torch.isfinite(loss)
 
 
+@pytest.mark.slow
 def test_a_crop_is_all_that_is_encoded_and_the_policys_must_be_the_same(source, weights, tmp_path):
     crop = [0.25, 0.5, 0.75, 1.0]
     encode(settings(source, weights, tmp_path / "out", crop=crop))
@@ -177,6 +179,7 @@ def test_a_crop_is_all_that_is_encoded_and_the_policys_must_be_the_same(source, 
         make_policy(policy_config(weights), ds_meta=dataset.meta)
 
 
+@pytest.mark.slow
 def test_a_readout_of_patches_trains_on_a_set_that_has_them(source, encoded, weights, tmp_path):
     policy_fields = policy_config(weights, readout="mean")
     with pytest.raises(FileNotFoundError, match="--patches=true"):
@@ -238,6 +241,7 @@ def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, mon
 
 
 @pytest.mark.parametrize("patches", [False, True])
+@pytest.mark.slow
 def test_an_interrupted_run_continues_with_its_next_episode(patches, source, weights, encoded, tmp_path, monkeypatch):
     encoder = features_encode._encode
     seen = []

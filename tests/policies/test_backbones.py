@@ -22,6 +22,7 @@ from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_tensors, state_sha256
 
+LARGE = ("clip_vitb16", "dinov2_vits14")
 THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
 
 
@@ -31,7 +32,9 @@ def no_hub(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
 
 
-@pytest.mark.parametrize("name", BACKBONES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in BACKBONES]
+)
 def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
     spec = BACKBONES[name]
     state, source = load_weights(spec, str(weights(name)))
@@ -100,6 +103,7 @@ def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name
         assert (ours - exactly).norm() < 2 * (eagerly - exactly).norm() + ROUNDING * exactly.norm()
 
 
+@pytest.mark.slow
 def test_weights_loaded_after_the_first_image_are_the_ones_used(weights, images):
     spec = BACKBONES["vit_tiny16"]
     encoder = FrozenEncoder(spec, NATIVE[-1])
@@ -278,6 +282,7 @@ def test_what_is_more_than_tensors_is_not_loaded_and_nobody_is_told_how_to(conte
     assert "weights_only" not in str(refusal.value) and "run\n" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_openvino_reports_nothing_over_the_network(tmp_path):
     """pip installs a package beside it that does, where `make setup` leaves it out."""
     (tmp_path / "openvino_telemetry.py").write_text("raise SystemExit('it would report')")

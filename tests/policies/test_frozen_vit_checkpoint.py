@@ -27,6 +27,7 @@ def edit_config(checkpoint: Path, **fields: object) -> None:
 
 
 @pytest.mark.parametrize("save_backbone", [True, False])
+@pytest.mark.slow
 def test_a_loaded_checkpoint_acts_the_same(save_backbone, make_policy, local_weights, images, tmp_path, caplog):
     policy = make_policy(save_backbone=save_backbone, backbone_path=str(local_weights)).eval()
     policy.save_pretrained(tmp_path / "checkpoint")
@@ -52,6 +53,7 @@ def test_state_dicts_load_strictly(save_backbone, make_policy, tmp_path):
     assert load_model(policy, tmp_path / "model.safetensors", strict=True) == (set(), [])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_can_be_fine_tuned_with_the_other_choice(make_policy, images, tmp_path):
     policy = make_policy(save_backbone=False).eval()
     policy.save_pretrained(tmp_path / "small")

@@ -14,10 +14,10 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES, chec
 
 TIMM = (
     "vit_tiny_patch16_224.augreg_in21k_ft_in1k",
-    "vit_small_patch14_reg4_dinov2.lvd142m",
+    pytest.param("vit_small_patch14_reg4_dinov2.lvd142m", marks=pytest.mark.slow),
     "resnet18.a1_in1k",
     "convnextv2_atto.fcmae_ft_in1k",
-    "swin_tiny_patch4_window7_224.ms_in1k",
+    pytest.param("swin_tiny_patch4_window7_224.ms_in1k", marks=pytest.mark.slow),
 )
 SMALL = {"num_hidden_layers": 1, "hidden_size": 48, "num_attention_heads": 3, "intermediate_size": 64}
 TRANSFORMERS = {
@@ -73,6 +73,7 @@ def test_a_model_of_transformers_encodes_as_its_folder_says(kind, tmp_path, imag
         ("hf/facebook/dinov2-small", "dinov2_vits14"),
     ],
 )
+@pytest.mark.slow
 def test_what_is_an_entry_too_gives_the_entrys_features(named, entry, weights, images, tmp_path):
     folder = weights(entry)
     if named.startswith("hf/"):
