@@ -214,8 +214,8 @@ def test_a_sweep_has_a_name_and_a_beginning_of_its_own(sweeps, said, tmp_path):
 ONE_VARIANT = STUDY | {"variants": {"dinov2": {"seeds": 10}}, "analysis": {}}
 
 
-@pytest.mark.parametrize("study, sections", [(STUDY, ["fixed", "moved"]), (ONE_VARIANT, ["fixed"])])
 @pytest.mark.slow
+@pytest.mark.parametrize("study, sections", [(STUDY, ["fixed", "moved"]), (ONE_VARIANT, ["fixed"])])
 def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_nothing(study, sections, tmp_path):
     names = [*study["variants"], *study["references"]]
     findings = findings_of(study, study_rows(study), tmp_path, sweeps={"position": ["fixed", "moved"]})

@@ -33,7 +33,7 @@ def test_the_valid_one_is_opened(valid):
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.slow) if kind in COSTLY else kind for kind in READ]
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in COSTLY else ()) for kind in READ]
 )
 def test_what_is_wrong_with_it_is_seen_when_it_is_opened(kind, valid, tmp_path):
     for number in range(TIMES_COSTLY if kind in COSTLY else TIMES):

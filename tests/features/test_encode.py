@@ -240,8 +240,8 @@ def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, mon
         make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
 
 
-@pytest.mark.parametrize("patches", [False, True])
 @pytest.mark.slow
+@pytest.mark.parametrize("patches", [False, True])
 def test_an_interrupted_run_continues_with_its_next_episode(patches, source, weights, encoded, tmp_path, monkeypatch):
     encoder = features_encode._encode
     seen = []

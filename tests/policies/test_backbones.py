@@ -23,8 +23,12 @@ from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_tensors, state_sha256
 
 LARGE = ("clip_vitb16", "dinov2_vits14")
-BACKBONES_BY_COST = [pytest.param(name, marks=pytest.mark.slow) if name in LARGE else name for name in BACKBONES]
 THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
+
+
+def by_cost(name: str, *others):
+    """A backbone as a test's parameter, slow if it is large."""
+    return pytest.param(name, *others, marks=pytest.mark.slow if name in LARGE else ())
 
 
 @pytest.fixture
@@ -33,7 +37,7 @@ def no_hub(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
 
 
-@pytest.mark.parametrize("name", BACKBONES_BY_COST)
+@pytest.mark.parametrize("name", map(by_cost, BACKBONES))
 def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
     spec = BACKBONES[name]
     state, source = load_weights(spec, str(weights(name)))
@@ -85,11 +89,7 @@ AVX2 and on one with AVX-512). bfloat16 rounds each number by up to 2e-3 of it."
 
 
 @pytest.mark.parametrize(
-    ("name", "precision"),
-    [
-        *(pytest.param(name, NATIVE[-1], marks=pytest.mark.slow if name in LARGE else ()) for name in BACKBONES),
-        ("vit_tiny16", "float32"),
-    ],
+    ("name", "precision"), [*(by_cost(name, NATIVE[-1]) for name in BACKBONES), ("vit_tiny16", "float32")]
 )
 def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name, precision, weights, monkeypatch):
     pytest.importorskip("openvino", reason="the extra `cpu` supplies it")

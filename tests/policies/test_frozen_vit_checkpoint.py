@@ -26,8 +26,8 @@ def edit_config(checkpoint: Path, **fields: object) -> None:
     (checkpoint / "config.json").write_text(json.dumps(config | fields))
 
 
-@pytest.mark.parametrize("save_backbone", [True, False])
 @pytest.mark.slow
+@pytest.mark.parametrize("save_backbone", [True, False])
 def test_a_loaded_checkpoint_acts_the_same(save_backbone, make_policy, local_weights, images, tmp_path, caplog):
     policy = make_policy(save_backbone=save_backbone, backbone_path=str(local_weights)).eval()
     policy.save_pretrained(tmp_path / "checkpoint")

@@ -66,6 +66,7 @@ def test_a_model_of_transformers_encodes_as_its_folder_says(kind, tmp_path, imag
     assert (spec.repo_id, spec.revision) == ("somebody/model", "main")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("named", "entry"),
     [
@@ -73,7 +74,6 @@ def test_a_model_of_transformers_encodes_as_its_folder_says(kind, tmp_path, imag
         ("hf/facebook/dinov2-small", "dinov2_vits14"),
     ],
 )
-@pytest.mark.slow
 def test_what_is_an_entry_too_gives_the_entrys_features(named, entry, weights, images, tmp_path):
     folder = weights(entry)
     if named.startswith("hf/"):
