@@ -20,7 +20,7 @@ import yaml
 from commands import call
 from random_features import config, tiny_weights  # noqa: F401
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, REWARD_PLACED, get_task
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, OBS_TYPES, REWARD_PLACED, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
 
 pytest.importorskip("vla_eval", reason="extra `evaluators`")
@@ -129,20 +129,36 @@ def test_holding_keeps_the_gripper_and_moves_nothing(benchmark_class):
     assert benchmark.get_hold_action({"actions": np.array([0.1, 0, 0, -1])})["actions"].tolist() == [0, 0, 0, -1]
 
 
-@pytest.fixture
-def untrained(config, tmp_path) -> Path:  # noqa: F811
-    """A checkpoint of frozen_vit as LeRobot keeps one, its heads random."""
+@pytest.fixture(params=["base"])
+def untrained(request, config, tmp_path) -> Path:  # noqa: F811
+    """A checkpoint of frozen_vit as LeRobot keeps one, its heads random, which looks through one camera."""
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies import make_pre_post_processors
 
     from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 
-    fields = config(save_backbone=True)
-    fields.input_features = {"observation.images.base": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
+    fields = config(save_backbone=True, camera=request.param)
+    fields.input_features = {f"observation.images.{request.param}": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))}
     FrozenViTChunkPolicy(fields).save_pretrained(tmp_path / "untrained")
     for processor in make_pre_post_processors(fields):
         processor.save_pretrained(tmp_path / "untrained")
     return tmp_path / "untrained"
+
+
+@pytest.mark.parametrize("untrained", ["base", "wrist"], indirect=True)
+def test_the_model_server_gives_a_policy_the_camera_that_it_was_trained_on(untrained, monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    server_class = resolve_import_string("model_server:ModelServer")
+    own = json.loads((untrained / "config.json").read_text())["camera"]
+    cameras = dict.fromkeys(OBS_TYPES["pixels_agent_pos"])
+
+    def sees(images, **options):
+        server = server_class("frozen_vit", str(untrained), device="cpu", **options)
+        return server._resolve_image_map(images)
+
+    assert sees(cameras) == {own: f"observation.images.{own}"}
+    assert sees(cameras, image_keys={"base": own}) == {"base": f"observation.images.{own}"}
+    assert sees({"front": None}) == {"front": f"observation.images.{own}"}
 
 
 def wait_for(address: str, server: subprocess.Popen) -> None:
