@@ -19,7 +19,8 @@ from lerobot_constructskill.contract import (
     get_task,
     select_tasks,
 )
-from lerobot_constructskill.envs.gym_env import MANISKILL_CHANNELS, ConstructSkillEnv
+from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 OBS_TYPE = "pixels_agent_pos"
 

@@ -12,7 +12,14 @@ import numpy as np
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.spread import mean_rate
 from lerobot_constructskill.board.protocol import CLAIMED, LEVELS, RANKED_FROM, TRAINING_SEEDS
-from lerobot_constructskill.board.submission import NAME, Claim, Declaration, Submission, read_submission
+from lerobot_constructskill.board.submission import (
+    NAME,
+    Claim,
+    Declaration,
+    Submission,
+    is_replayable,
+    read_submission,
+)
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError, MissingError
 
@@ -63,7 +70,7 @@ class Entry:
 
     @property
     def is_ranked(self) -> bool:
-        return not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
+        return not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM and is_replayable(self.said)
 
     @property
     def missing_seeds(self) -> int:
@@ -102,7 +109,10 @@ def read_entries(root: Path) -> list[Entry]:
 def _entry(root: Path, path: Path) -> Entry:
     if not NAME.allows(path.name):
         raise InputError(f"The folder of an entry must be called by {NAME.meaning}, not {path.name!a}.")
-    submission = read_submission(path)
+    try:
+        submission = read_submission(path)
+    except (InputError, MissingError) as error:
+        raise type(error)(f"Entry '{path.name}': {error}") from error
     verdict = read_verdict(root / VERIFIED / f"{path.name}.json", {"submission": submission.sha256})
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
 
@@ -129,8 +139,8 @@ def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     """Rank of each entry that has one in a setting, and whether it is shared.
 
-    An entry is behind those whose interval over seeds lies wholly above its own, and ties with all others: so entries
-    that the seeds cannot tell apart have one rank.
+    An entry is behind those whose interval over seeds lies wholly above its own, so an entry that no seeds put behind
+    another has rank 1. Two intervals that overlap can have different ranks: a third may lie above one of them alone.
     """
     ranked = [entry for entry in entries if entry.is_ranked and setting in entry.standings]
     placed = {entry.name: entry.standings[setting].placed for entry in ranked}

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable
 from dataclasses import fields
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -58,8 +59,8 @@ def _metrics(claims: list[Claim]) -> dict[str, list]:
 
 
 def _rewards(claim: Claim) -> list[float]:
-    """The reward of every step: the stage reached by then."""
-    lifted, placed = (step or claim.steps + 1 for step in (claim.lift_step, claim.place_step))
+    """The reward of every step: the stage reached by then. An episode that failed with an error has none of it."""
+    lifted, placed = (inf if step is None else step for step in (claim.lift_step, claim.place_step))
     steps = range(1, max(claim.steps, 1) + 1)
     return [REWARD_PLACED if step >= placed else REWARD_LIFTED if step >= lifted else 0.0 for step in steps]
 

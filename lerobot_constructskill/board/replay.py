@@ -55,7 +55,7 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
     if not is_replayable(declaration):
         raise InputError(
             f"The submission was made with '{declaration.backend}'; only {PHYSICS} can be replayed, and results of "
-            "another backend stay claimed, on a board of their own."
+            "another backend stay claimed and have no rank."
         )
     acted = [claim for claim in submission.claims if claim.error is None]
     chosen = acted if sample is None else random.SystemRandom().sample(acted, min(sample, len(acted)))

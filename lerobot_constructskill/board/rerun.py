@@ -19,7 +19,8 @@ class Rates:
 
     Args:
         p_value: of a permutation test, two-tailed and corrected by Holm over the settings. Its unit is the start: the
-            checkpoints are the same in both, so starts of one kind could be dealt to the two at random.
+            checkpoints are the same in both, so starts of one kind could be dealt to the two at random. Where there is
+            one start alone, it is the training seed.
     """
 
     setting: str
@@ -105,16 +106,20 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
         raise InputError("The re-run does not have the submission's training seeds.")
     names = sorted(submission.declaration.settings)
     pairs = [(placed(submission, name), placed(again, name)) for name in names]
-    rng = np.random.default_rng(0)  # the same verdict whenever it is asked for
-    p_values = holm([mean_p_value(*pair, rng) for pair in pairs])
+    # The same verdict whenever it is asked for
+    p_values = holm([mean_p_value(*pair, np.random.default_rng(0)) for pair in pairs])
     rows = zip(names, pairs, p_values, strict=True)
     return Comparison(value, [Rates(name, own.mean(), fresh.mean(), p) for name, (own, fresh), p in rows])
 
 
 def placed(submission: Submission, setting: str) -> np.ndarray:
-    """Share of the training seeds that placed, from each start of a setting, (starts,); errors count as failed."""
-    by_start = defaultdict(list)
+    """Share of the training seeds that placed, from each start of a setting, (starts,); errors count as failed.
+
+    Of a setting with one start: which training seeds placed, (training seeds,).
+    """
+    unit = "training_seed" if submission.declaration.settings[setting].episodes == 1 else "evaluation_seed"
+    by_unit = defaultdict(list)
     for claim in submission.claims:
         if claim.setting == setting:
-            by_start[claim.evaluation_seed].append(claim.placed)
-    return np.array([np.mean(of) for of in by_start.values()])
+            by_unit[getattr(claim, unit)].append(claim.placed)
+    return np.array([np.mean(of) for of in by_unit.values()])

@@ -22,6 +22,7 @@ from lerobot_constructskill.board.protocol import PHYSICS, SUITES, Setting, clas
 from lerobot_constructskill.board.strangers import bounded_memory, make, read_files, read_yaml
 from lerobot_constructskill.bounds import Among, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import STAGES, get_task
+from lerobot_constructskill.envs.actions import within_reach
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
 from lerobot_constructskill.errors import InputError, first_line, plural
 
@@ -330,16 +331,27 @@ def _check(claim: Claim, setting: Setting) -> None:
         raise InputError(f"{claim.where} has {len(claim.actions)} numbers for {claim.steps} actions.")
     if not np.isfinite(claim.actions).all():
         raise InputError(f"{claim.where} has an action that is not finite.")
+    if claim.placed != (claim.stage == "placed") or claim.lifted < (claim.stage == "lifted"):
+        raise InputError(f"{claim.where}: stage {claim.stage} is not what lifted and placed say.")
+    for name, did, step in (("lift", claim.lifted, claim.lift_step), ("place", claim.placed, claim.place_step)):
+        if did != (step is not None):
+            raise InputError(f"{claim.where}: there is a {name}_step exactly where that happened.")
+        if did and not 1 <= step <= claim.steps:
+            raise InputError(f"{claim.where}: {name}_step must be 1 to {claim.steps}, not {step}.")
+    if claim.placed and claim.place_step != claim.steps:
+        raise InputError(f"{claim.where}: the placement ends an episode, so place_step must be {claim.steps}.")
 
 
 def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:
-    """Two trainings of one policy never place with the same actions to the last bit."""
+    """Two trainings of one policy never place with the same actions to the last bit, as they are executed."""
     if declaration.about.observes == "nothing":
         return
     first: dict[tuple, Claim] = {}
     for claim in claims:
         if claim.placed:
-            same = claim.setting, claim.evaluation_seed, claim.actions.tobytes()
+            names = get_task(declaration.settings[claim.setting].task).action_names
+            executed = within_reach(claim.actions.reshape(-1, len(names)), names) + 0.0  # -0.0 is 0.0
+            same = claim.setting, claim.evaluation_seed, executed.tobytes()
             other = first.setdefault(same, claim)
             if other is not claim:
                 raise InputError(f"{claim.where} has exactly the actions of training seed {other.training_seed}.")

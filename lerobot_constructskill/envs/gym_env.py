@@ -14,31 +14,17 @@ from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     FPS,
-    GRIPPER,
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
     IMAGE_SIZE,
     OBS_TYPES,
-    ROTATION,
-    ROTATION_SIGN,
     STATE_NAMES,
-    TRANSLATION,
     get_task,
 )
+from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, within_reach
 from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.perturbations import Perturbation
-
-CHANNEL_SCALE = {
-    **dict.fromkeys(TRANSLATION, ACTION_SCALE),
-    **dict.fromkeys(ROTATION, ROTATION_SIGN * ACTION_SCALE),
-    GRIPPER: 1.0,
-}
-"""Metres or radians that ManiSkill calls 1.0; divided by, because its reciprocal rounds otherwise and data sets must
-replay bit for bit."""
-
-MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
-"""The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 RenderBackend = Annotated[str, Among(("auto", "gpu", "cpu", "none"))]
@@ -226,9 +212,8 @@ class ConstructSkillEnv(gym.Env):
         if action.shape != (len(names),) or not np.isfinite(action).all():
             raise InputError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
         scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
-        for name, value in zip(names, action, strict=True):
-            scaled[MANISKILL_CHANNELS.index(name)] = value / CHANNEL_SCALE[name]
-        return np.clip(scaled, -1, 1)
+        scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = within_reach(action, names)
+        return scaled
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
         # In one piece: what has gaps takes four times as long to be sent to another process.

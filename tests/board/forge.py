@@ -105,6 +105,33 @@ def a_success_copied_to_the_other_training_seed(root, rng):
 
 
 @forges(READ)
+def a_success_copied_beyond_the_jaws_reach(root, rng):
+    """The gripper asked for more than there is: other numbers, and the same actions once they are executed."""
+
+    def change(rows):
+        good = placed(rows, rng)
+        (other,) = (
+            row
+            for row in rows
+            if row["training_seed"] != good["training_seed"]
+            and (row["setting"], row["evaluation_seed"]) == (good["setting"], good["evaluation_seed"])
+        )
+        other.update({name: value for name, value in good.items() if name != "training_seed"})
+        other["actions"] = [4 * one if number % 4 == 3 else one for number, one in enumerate(good["actions"])]
+
+    edit(root, change)
+
+
+@forges(READ)
+def outcomes_that_contradict_each_other(root, rng):
+    others = (
+        *({"placed": False}, {"lifted": False}, {"stage": "none"}, {"stage": "lifted"}, {"lift_step": None}),
+        *({"place_step": None}, {"place_step": 1}, {"place_step": 10**9}, {"lift_step": -7}, {"lift_step": 0}),
+    )
+    edit(root, lambda rows: placed(rows, rng).update(rng.choice(others)))
+
+
+@forges(READ)
 def another_start(root, rng):
     edit(root, lambda rows: rng.choice(rows).update(evaluation_seed=int(rng.integers(2**31))))
 
@@ -303,16 +330,18 @@ def an_address_that_is_a_script(root, rng):
 
 
 @forges(REPLAYED)
-def one_outcome(root, rng):
-    field = rng.choice(["placed", "lifted", "lift_step", "place_step", "stage"])
-    other = {"stage": "none", "lift_step": None, "place_step": 1}
-    edit(root, lambda rows: placed(rows, rng).update({field: other.get(field, False)}))
+def another_outcome(root, rng):
+    others = {"lift_step": 1}, {"placed": False, "place_step": None, "stage": "in_bin"}
+    edit(root, lambda rows: placed(rows, rng).update(rng.choice(others)))
 
 
 @forges(REPLAYED)
 def a_failure_called_success(root, rng):
-    success = {"lifted": True, "placed": True, "stage": "placed", "lift_step": 50, "place_step": 100}
-    edit(root, lambda rows: rng.choice([row for row in rows if not row["placed"]]).update(success))
+    def change(rows):
+        row = rng.choice([row for row in rows if not row["placed"]])
+        row.update(lifted=True, placed=True, stage="placed", lift_step=50, place_step=row["steps"])
+
+    edit(root, change)
 
 
 @forges(REPLAYED)
@@ -320,7 +349,7 @@ def actions_of_another_start(root, rng):
     def change(rows):
         row = placed(rows, rng)
         others = [one for one in rows if one["setting"] == row["setting"] and one["placed"] and one is not row]
-        row.update({name: others[0][name] for name in ("actions", "steps", "lift_step")})
+        row.update({name: others[0][name] for name in ("actions", "steps", "lift_step", "place_step")})
 
     edit(root, change)
 
@@ -352,6 +381,7 @@ def an_end_too_early(root, rng):
     def change(rows):
         row = placed(rows, rng)
         row["steps"] -= int(rng.integers(1, 9))
+        row["place_step"] = row["steps"]
         row["actions"] = row["actions"][: 4 * row["steps"]]
 
     edit(root, change)
@@ -362,6 +392,7 @@ def actions_after_the_end(root, rng):
     def change(rows):
         row = placed(rows, rng)
         row["steps"] += 1
+        row["place_step"] = row["steps"]
         row["actions"] = [*row["actions"], 0.0, 0.0, 0.0, 1.0]
 
     edit(root, change)

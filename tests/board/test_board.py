@@ -96,6 +96,8 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     bad, few = (next(entry for entry in entries if entry.name == name) for name in ("bad", "few"))
     assert bad.standings["block_to_bin"].errors == 1 and bad.standings["block_to_bin"].placed.value == 0
     assert few.missing_seeds == 8 and not few.is_ranked
+    unseen = replace(good.submission, declaration=replace(good.said, backend="physx_cuda, gpu rendering"))
+    assert not replace(good, submission=unseen).is_ranked, "nobody can replay it"
     twin = replace(good, name="twin")
     assert ranks([good, twin], "block_to_bin") == {"good": (1, True), "twin": (1, True)}
 
@@ -118,6 +120,11 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
         assert read_entries(root)[0].level == level
     path.write_text('{"level": "best"}')
     with pytest.raises(InputError, match="not a verdict"):
+        read_entries(root)
+    path.unlink()
+    declaration = root / "entries" / entry.name / "submission.yaml"
+    declaration.write_text(declaration.read_text().replace("version: 1", "version: 7"))
+    with pytest.raises(InputError, match=f"^Entry '{entry.name}': .*version"):
         read_entries(root)
     (root / "entries" / "No Name").mkdir()
     with pytest.raises(InputError, match="called by a name"):
@@ -175,3 +182,9 @@ def test_rewards_are_those_of_the_environment():
     metrics = info["per_task"][0]["metrics"]
     assert metrics["max_rewards"] == [1.0] and metrics["successes"] == [True]
     assert metrics["sum_rewards"] == [0.5 * (fixed.steps - fixed.lift_step) + 1.0]
+
+
+def test_an_episode_that_failed_with_an_error_has_no_reward(many):
+    bad = next(entry for entry in read_entries(many) if entry.name == "bad")
+    (task,) = eval_info(bad, 0)["per_task"]
+    assert task["metrics"]["max_rewards"][0] == task["metrics"]["sum_rewards"][0] == 0

@@ -8,7 +8,7 @@ import yaml
 
 from lerobot_constructskill.board.protocol import Setting, fresh_settings, fresh_start
 from lerobot_constructskill.board.rerun import compare, instructions
-from lerobot_constructskill.board.submission import Claim, Submission, read_submission
+from lerobot_constructskill.board.submission import MOST_SETTINGS, Claim, Submission, read_submission
 from lerobot_constructskill.errors import InputError
 
 STARTS, VALUE = 50, "beef"
@@ -58,6 +58,29 @@ def test_seeds_are_the_same_in_any_order_and_a_draw_is_told(submission):
     (said,) = [yaml.safe_load(line) for line in told.splitlines() if line.startswith("'on'")]
     first = fresh_start(submission.sha256, VALUE)
     assert {name: Setting(**of) for name, of in said.items()} == fresh_settings(settings, first)
+
+
+def test_one_start_is_compared_by_training_seeds(submission):
+    """As `brick_to_bin` has one: all its ten seeds placed, and none does when it is run anew."""
+    said = replace(submission.declaration, settings={"fixed": Setting("brick_to_bin", 1)}, training_seeds=[*range(10)])
+
+    def placing(declaration, seeds):
+        (start,) = declaration.settings["fixed"].starts
+        runs = [Claim(start, placed=seed < seeds, setting="fixed", training_seed=seed) for seed in range(10)]
+        return replace(submission, declaration=declaration, claims=runs)
+
+    own = placing(said, 10)
+    fresh = replace(said, settings=fresh_settings(said.settings, fresh_start(own.sha256, VALUE)))
+    compare(own, placing(fresh, 9), VALUE).confirm()
+    with pytest.raises(InputError, match="100% submitted, 0% run anew"):
+        compare(own, placing(fresh, 0), VALUE).confirm()
+
+
+def test_many_settings_hide_nothing(submission):
+    settings = {f"setting_{number}": Setting("block_to_bin", STARTS) for number in range(MOST_SETTINGS)}
+    said = replace(submission.declaration, settings=settings)
+    own = replace(submission, declaration=said, claims=claims(settings, 1.0))
+    assert all(one.is_worse for one in compare(own, rerun(own, 0.0), VALUE).rates)
 
 
 def test_better_on_fresh_starts_is_confirmed(submission):

@@ -1,0 +1,23 @@
+"""From an action's metres and radians to what ManiSkill executes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER, ROTATION, ROTATION_SIGN, TRANSLATION
+
+CHANNEL_SCALE = {
+    **dict.fromkeys(TRANSLATION, ACTION_SCALE),
+    **dict.fromkeys(ROTATION, ROTATION_SIGN * ACTION_SCALE),
+    GRIPPER: 1.0,
+}
+"""Metres or radians that ManiSkill calls 1.0; divided by, because its reciprocal rounds otherwise and data sets must
+replay bit for bit."""
+
+MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
+"""The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
+
+
+def within_reach(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Actions (..., A) with these channels as they are executed, whatever was asked for: in ManiSkill's [-1, 1]."""
+    return np.clip(actions / np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32), -1, 1)
