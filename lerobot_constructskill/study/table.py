@@ -39,7 +39,7 @@ class Table:
         self.root, self.runs, self.store = root, runs, store
         self._made: dict[str, list[EpisodeRow]] = {}
         self._rows: dict[str, list[Row]] = {}
-        self._kept = _finished(root / ROWS)
+        self._kept = _run_so_far(root / ROWS)
 
     def missing(self) -> list[Run]:
         """The runs that have not been made."""
@@ -62,12 +62,13 @@ class Table:
             self._made[name] = load_rows(file, EpisodeRow)
         return self._made.get(name) or self._kept_rows(run)
 
-    def _kept_rows(self, run: Run) -> list[Row] | None:
-        """The rows of a run that the table in the folder had, if it ran to its end."""
-        return next((rows for key in _keys(run) if (rows := self._kept.get(key))), None)
+    def _kept_rows(self, run: Run, failed: bool = False) -> list[Row] | None:
+        """The rows of a run that the table in the folder had, if it ran to its end, or if it failed."""
+        kept = (self._kept[key] for key in _keys(run) if key in self._kept)
+        return next((rows for rows in kept if bool(rows[0].error_kind) == failed), None)
 
     def lost(self) -> list[str]:
-        """The finished runs of the table in the folder that neither this study nor the store has."""
+        """The runs of the table in the folder, failed ones too, that neither this study nor the store has."""
         ours = {key for run in self.runs for key in _keys(run)}
         gone = [
             row
@@ -97,7 +98,10 @@ class Table:
     def _rows_of(self, run: Run) -> list[Row]:
         if run.id not in self._rows and self.episodes(run) is not None:
             self._rows[run.id] = list(self._made_rows(run))
-        return self._rows.get(run.id) or [self._missing_row(run)]
+        if rows := self._rows.get(run.id):
+            return rows
+        failed = self._kept_rows(run, failed=True)  # a row until it is made again: it is not run here, but it was
+        return [replace(row, **_names(run)) for row in failed] if failed else [self._missing_row(run)]
 
     def _missing_row(self, run: Run) -> Row:
         seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.evaluation["seed"]}
@@ -143,15 +147,15 @@ class Table:
         return str(path)
 
 
-def _finished(file: Path) -> dict[tuple[str, str, str | None], list[Row]]:
-    """The rows of each run in a study's table that ran to its end, by setting, variant and digest."""
-    rows = [row for row in load_rows(file, Row) if not row.error_kind] if file.exists() else []
+def _run_so_far(file: Path) -> dict[tuple[str, str, str | None], list[Row]]:
+    """The rows of each run in a study's table that was made, failed or not, by setting, variant and digest."""
+    rows = [row for row in load_rows(file, Row) if row.error_kind != NOT_RUN] if file.exists() else []
     by_run = groupby(rows, key=lambda row: (row.setting, row.variant, row.run))
     return {key: list(episodes) for key, episodes in by_run}
 
 
 def _keys(run: Run) -> list[tuple[str, str, str]]:
-    """What the rows of a run may be found by in `_finished`."""
+    """What the rows of a run may be found by in `_run_so_far`."""
     return [(run.arm.setting, run.arm.name, name) for name in run.digests]
 
 

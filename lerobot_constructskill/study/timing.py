@@ -24,6 +24,9 @@ def seconds_by_stage(root: Path) -> dict[str, float]:
     total: dict[str, float] = {}
     file = root / TIMINGS
     for line in file.read_text().splitlines() if file.exists() else []:
-        entry = json.loads(line)
+        try:
+            entry = json.loads(line)
+        except ValueError:  # a line that a full disk or a power cut tore
+            continue
         total[entry["stage"]] = total.get(entry["stage"], 0) + entry["seconds"]
     return total

@@ -21,6 +21,7 @@ from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.table import Table, status
+from lerobot_constructskill.study.timing import TIMINGS, seconds_by_stage, timed
 from lerobot_constructskill.study.validate import list_pairs
 from lerobot_constructskill.training.checkpoints import FACTS
 from lerobot_constructskill.training.recipe import Training
@@ -262,6 +263,33 @@ def test_whoever_has_the_folder_of_a_study_goes_on_with_it_without_its_runs(tmp_
     assert len(Table(tmp_path / "x", other, empty).missing()) == len(other)
     run_study(study(), "", tmp_path / "x", empty, Options())  # nothing to run: neither data nor weights exist here
     pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
+
+
+def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
+    table = make_all(study(), tmp_path)
+    row = {"evaluation_seed": 1000, "episode": 0, "error_kind": "weights", "error": "none here"}
+    failed = [EpisodeRow(run=run.artifact.digest, training_seed=run.seed, **row) for run in table.runs[:1]]
+    write_rows(failed, table.store.folder(table.runs[0].artifact) / EPISODES, EpisodeRow)
+    Table(tmp_path / "x", table.runs, table.store).write()
+    published = read_rows(tmp_path / "x" / "rows.parquet")
+    assert set(published["error_kind"].dropna()) == {"weights"}
+    elsewhere = Table(tmp_path / "x", table.runs, Store(tmp_path / "elsewhere"))
+    assert elsewhere.missing() == table.runs[:1], "it is tried again"
+    elsewhere.write()
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
+    fewer = study(variants={"b": study().variants["b"]})
+    with pytest.raises(InputError, match=r"rows of 3 runs, such as fixed/a/seed_0.* would be lost"):
+        run_study(fewer, "", tmp_path / "x", Store(tmp_path / "elsewhere"), Options())
+
+
+def test_a_torn_line_of_times_is_left_out(tmp_path):
+    with timed(tmp_path, "encoding"):
+        pass
+    with (tmp_path / TIMINGS).open("a") as file:
+        file.write('{"stage": "encod{"stage": "evaluation", "seconds": 0.0}\n')
+    with timed(tmp_path, "evaluation"):
+        pass
+    assert seconds_by_stage(tmp_path) == {"encoding": 0.0, "evaluation": 0.0}
 
 
 def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
