@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH"
-OUT="${OUT:-outputs/shifted}" SEEDS="${SEEDS:-0}"
+OUT="${OUT:-outputs/demo}" SEEDS="${SEEDS:-0}"
 
 trap 'kill $(jobs -p) 2>/dev/null || true' EXIT # what is interrupted leaves nothing running
 

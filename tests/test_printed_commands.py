@@ -45,7 +45,9 @@ NOT_RUN = {
     "constructskill-push": "needs the Hub: tests/dataset/test_hub.py pushes to one of its own",
     "constructskill-check --repo_id=YOU": "needs the Hub: tests/dataset/test_hub.py",
     "lerobot-train --dataset.repo_id=YOU": "needs the Hub, and ends in dots",
-    "--rename_map": "flags without a command",
+    "lerobot-eval --policy.path=outputs/smolvla": "needs its weights: tests/test_any_policy.py has random ones",
+    "python examples/vla_evaluation_harness": "serves until it is killed: tests/test_vla_evaluation_harness.py",
+    "PYTHONPATH=examples/vla_evaluation_harness": "asks that server",
     "constructskill-check-task --task=lintel_to_wall": "a task that the reader is to write: tests/test_check_task.py",
 }
 """How a printed command starts to why it is not run."""
