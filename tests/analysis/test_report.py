@@ -24,8 +24,9 @@ from synthetic_study import (
 from lerobot_constructskill.analysis.report import ink
 from lerobot_constructskill.analysis.report.answer import answer, status
 from lerobot_constructskill.analysis.report.collect import collect
+from lerobot_constructskill.analysis.report.figures import grid_figure
 from lerobot_constructskill.analysis.report.page import read_study
-from lerobot_constructskill.analysis.report.wording import p_value, roman, signed
+from lerobot_constructskill.analysis.report.wording import p_value, roman, seed_spans, signed
 from lerobot_constructskill.analysis.stats.comparisons import Verdict
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.report import ReportConfig, report
@@ -152,6 +153,32 @@ def test_tables_group_by_seeds_and_repeat_the_baseline(findings):
     backbones, ablations = findings.settings[0].tables
     assert (backbones.seeds, backbones.baseline, ablations.seeds) == (10, None, 3)
     assert list(ablations.baseline.runs["training_seed"]) == [0, 1, 2]
+
+
+def test_training_seeds_may_begin_anywhere(tmp_path):
+    """As those do on which choices are made, so that they are none that are reported."""
+    chosen = [("fixed", "one", seed) for seed in range(100, 103)]
+    rows = [row for run in chosen for row in episode_rows(SMALL, run, 2, 2)]
+    rows += [row for run in list(planned(SMALL))[2:] for row in episode_rows(SMALL, run, 2, 0)]
+    (setting,) = findings_of(SMALL, rows, tmp_path).settings
+    first, second = setting.tables
+    assert (first.spans, second.spans) == ([(100, 102)], [(0, 1)])
+    assert seed_spans([*first.spans, *second.spans]) == "seeds 100–102 and 0–1"
+    assert list(second.baseline.runs["training_seed"]) == [100, 101]
+    assert second.baseline.outcomes["placed"].counts == (2, 2)
+    figure = grid_figure(setting, 2).draw(ink.LIGHT)
+    placed = figure.axes[1]
+    assert [label.get_text() for label in placed.get_xticklabels()] == ["0", "1", "100", "101", "102"]
+    numbers = {text.get_text() for text in placed.texts}
+    assert numbers == {"2", "0", "3/3", "0/2"}, "every cell has its run"
+
+
+def test_variants_that_tie_in_episodes_have_their_own_seeds(tmp_path):
+    runs = list(planned(SMALL))
+    placed = dict(zip(runs, (2, 0, 1, 1), strict=True))
+    rows = [row for run in runs for row in episode_rows(SMALL, run, 2, placed[run])]
+    ((_, said),) = answer(findings_of(SMALL, rows, tmp_path))
+    assert "one placed the object in 1 of 2 seeds (" in said and "two placed the object in 2 of 2 seeds (" in said
 
 
 def test_what_a_setting_is_read_with_comes_from_the_rows(findings):

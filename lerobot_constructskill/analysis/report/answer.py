@@ -3,6 +3,8 @@
 from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
 from lerobot_constructskill.analysis.report.wording import episodes, listed, quoted, seeds, share_range, tau
 from lerobot_constructskill.analysis.stats.comparisons import Comparison, Verdict
+from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
+from lerobot_constructskill.analysis.stats.outcomes import Counts
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.rows import SIGHTLESS
 
@@ -66,13 +68,19 @@ def _best(lines: list[Line], n_episodes: int) -> str:
     if top == 0:
         return f"No variant placed the object in any of its seeds; {_lifts(rivals)}."
     best = [line for line in rivals if line.outcomes["placed"].mean.value == top]
-    placed = best[0].outcomes["placed"]
-    each = " each" if len(best) > 1 else ""
     rank = f", the most of {len(rivals)} variants with {seeds(most_seeds)}" if len(rivals) > len(best) else ""
-    return (
-        f"{listed([quoted(line.label) for line in best])} placed the object in {placed.counts.met} of "
-        f"{seeds(placed.counts.seeds)}{each} (95 % interval {share_range(placed.exact)}), "
-        f"in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
+    return f"{_placed_in(best)}, in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
+
+
+def _placed_in(lines: list[Line]) -> str:
+    """In how many seeds each placed; lines with equally many are named together."""
+    alike: dict[Counts, list[str]] = {}
+    for line in lines:
+        alike.setdefault(line.outcomes["placed"].counts, []).append(quoted(line.label))
+    return ", ".join(
+        f"{listed(labels)} placed the object in {counts.met} of {seeds(counts.seeds)}{' each' * (len(labels) > 1)} "
+        f"(95 % interval {share_range(clopper_pearson(counts))})"
+        for counts, labels in alike.items()
     )
 
 

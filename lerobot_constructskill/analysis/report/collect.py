@@ -112,8 +112,8 @@ def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.Data
         tables=tables,
         comparisons=comparisons,
         declared=len(pairs),
-        rate_tests={criterion: _rate_tests(made, pairs, criterion, rng) for criterion in CRITERIA},
-        correlations={criterion: _correlations(lines, ordered, criterion, rng) for criterion in CRITERIA},
+        rate_tests={criterion: _rate_tests(made, pairs, criterion) for criterion in CRITERIA},
+        correlations={criterion: _correlations(lines, ordered, criterion) for criterion in CRITERIA},
     )
 
 
@@ -141,7 +141,7 @@ def _line(label: str, planned: pd.DataFrame, runs: pd.DataFrame, rng: np.random.
         label=label,
         role=planned["role"].iloc[0],
         demonstrations=None if demonstrations.empty else demonstrations.iloc[0],
-        seeds=len(planned),
+        training_seeds=tuple(sorted(planned["training_seed"])),
         runs=runs,
         outcomes={criterion: _outcome(runs, criterion, rng) for criterion in CRITERIA} if finished else {},
         error=_mean_and_range(runs["heldout_mse_m2"]),
@@ -177,16 +177,18 @@ def _tables(lines: list[Line], planned: pd.DataFrame, rng: np.random.Generator) 
 def _baseline(first: Line, planned: pd.DataFrame, seeds: int, rng: np.random.Generator) -> Line | None:
     if first.seeds <= seeds:
         return None
-    own = planned[(planned["variant"] == first.name) & (planned["training_seed"] < seeds)]
+    chosen = first.training_seeds[:seeds]
+    own = planned[(planned["variant"] == first.name) & planned["training_seed"].isin(chosen)]
     label = f"{first.label}, first {seeds} seeds" if seeds > 1 else f"{first.label}, first seed"
-    return _line(label, own, first.runs[first.runs["training_seed"] < seeds], rng)
+    return _line(label, own, first.runs[first.runs["training_seed"].isin(chosen)], rng)
 
 
-def _rate_tests(lines: dict[str, Line], pairs: Pairs, criterion: str, rng: np.random.Generator) -> list[RateTest]:
+def _rate_tests(lines: dict[str, Line], pairs: Pairs, criterion: str) -> list[RateTest]:
+    """Each test draws from a generator of its own: what else is compared does not change its p-value."""
     rates = {name: line.runs[f"{criterion}_rate"].to_numpy() for name, line in lines.items()}
     made = [(a, b) for a, b in pairs if a in lines and b in lines]
     mean_holm, spread_holm = (
-        holm([test(rates[a], rates[b], rng) for a, b in made], family=len(pairs))
+        holm([test(rates[a], rates[b], np.random.default_rng(0)) for a, b in made], family=len(pairs))
         for test in (mean_p_value, spread_p_value)
     )
     return [
@@ -195,11 +197,10 @@ def _rate_tests(lines: dict[str, Line], pairs: Pairs, criterion: str, rng: np.ra
     ]
 
 
-def _correlations(
-    lines: list[Line], ordered: list[Line], criterion: str, rng: np.random.Generator
-) -> list[tuple[str, Correlation | None]]:
+def _correlations(lines: list[Line], ordered: list[Line], criterion: str) -> list[tuple[str, Correlation | None]]:
     def correlate(runs: pd.DataFrame) -> Correlation | None:
-        return kendall(*(runs[column].to_numpy() for column in ("heldout_mse_m2", criterion, "variant")), rng)
+        columns = (runs[column].to_numpy() for column in ("heldout_mse_m2", criterion, "variant"))
+        return kendall(*columns, np.random.default_rng(0))
 
     within = correlate(pd.concat([line.runs for line in lines]))
     of = {line.name: correlate(line.runs) for line in lines}

@@ -53,8 +53,8 @@ def outcome_figure(setting: SettingFindings) -> Drawing:
 
 def grid_figure(setting: SettingFindings, episodes: int) -> Drawing:
     """The paper's Figure 2a: episodes that met each criterion, one cell a seed."""
-    seeds = max(line.seeds for line in setting.lines)
-    stacked = seeds > 12
+    seeds = sorted({seed for line in setting.lines for seed in line.training_seeds})
+    stacked = len(seeds) > 12
 
     def draw(ink: Ink) -> Figure:
         rows, columns = (2, 1) if stacked else (1, 2)
@@ -239,39 +239,41 @@ def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:
                   fontsize=8.5, annotation_clip=False)  # fmt: skip
 
 
-def _grid(axis: Axes, lines: list[Line], criterion: str, seeds: int, episodes: int, ink: Ink) -> None:
+def _grid(axis: Axes, lines: list[Line], criterion: str, seeds: list[int], episodes: int, ink: Ink) -> None:
     ramp = LinearSegmentedColormap.from_list("ramp", ink.ramp)
     for y, line in enumerate(lines):
         runs = line.runs.set_index("training_seed")
-        for seed in range(line.seeds):
+        for seed in line.training_seeds:
             run = runs.loc[seed] if seed in runs.index else None
-            _cell(axis, seed, y, run, criterion, episodes, ramp, ink)
+            _cell(axis, seeds.index(seed), y, run, criterion, episodes, ramp, ink)
         if line.outcomes:
             counts = line.outcomes[criterion].counts
-            axis.annotate(f"{counts.met}/{counts.seeds}", (seeds - 0.4, y), va="center", xytext=(3, 0),
+            axis.annotate(f"{counts.met}/{counts.seeds}", (len(seeds) - 0.4, y), va="center", xytext=(3, 0),
                           textcoords="offset points", fontsize=8.5, annotation_clip=False)  # fmt: skip
-    axis.set(title=criterion.capitalize(), xlim=(-0.5, seeds - 0.5), ylim=(len(lines) - 0.45, -0.55), xlabel="seed")
-    step = 1 if seeds <= 40 else 10
-    axis.set_xticks(range(0, seeds, step))
+    axis.set(
+        title=criterion.capitalize(), xlim=(-0.5, len(seeds) - 0.5), ylim=(len(lines) - 0.45, -0.55), xlabel="seed"
+    )
+    step = 1 if len(seeds) <= 40 else 10
+    axis.set_xticks(range(0, len(seeds), step), seeds[::step])
     axis.tick_params(length=0, labelsize=8)
     axis.tick_params(axis="y", labelsize=9)
     axis.spines[:].set_visible(False)
 
 
-def _cell(axis: Axes, seed: int, y: int, run, criterion: str, episodes: int, ramp, ink: Ink) -> None:
-    place = {"xy": (seed - 0.45, y - 0.42), "width": 0.9, "height": 0.84}
+def _cell(axis: Axes, x: int, y: int, run, criterion: str, episodes: int, ramp, ink: Ink) -> None:
+    place = {"xy": (x - 0.45, y - 0.42), "width": 0.9, "height": 0.84}
     if run is None:
         axis.add_patch(Rectangle(**place, fill=False, edgecolor=ink.muted, linewidth=0.7, linestyle=(0, (2, 2))))
         return
     if pd.notna(run["error_kind"]):
         axis.add_patch(Rectangle(**place, facecolor=ink.paper, edgecolor=ink.alarm, linewidth=0.8))
-        axis.text(seed, y, "×", ha="center", va="center", color=ink.alarm, fontsize=10)
+        axis.text(x, y, "×", ha="center", va="center", color=ink.alarm, fontsize=10)
         return
     share = run[criterion] / episodes
     axis.add_patch(Rectangle(**place, facecolor=ramp(share), edgecolor="none"))
     light_text = (share > 0.55) == (ink.paper == "#ffffff")
     colour = ("#ffffff" if light_text else "#0c1116") if share else ink.muted
-    axis.text(seed, y, f"{run[criterion]}", ha="center", va="center", color=colour, fontsize=8)
+    axis.text(x, y, f"{run[criterion]}", ha="center", va="center", color=colour, fontsize=8)
 
 
 def _cell_key(episodes: int, ink: Ink) -> list[Patch]:

@@ -39,7 +39,7 @@ class Line:
         name, label: what the rows and what tables call it.
         role: as in the rows.
         demonstrations: name of the data set that it was trained on; None without one.
-        seeds: planned seeds.
+        training_seeds: those that are planned, in order.
         runs: its runs that were made, lines of `seed_outcomes`.
         outcomes: criterion to outcome; empty where no run finished without an error, so that policies that could
             not be had never look like zeros.
@@ -51,11 +51,15 @@ class Line:
     label: str
     role: str
     demonstrations: str | None
-    seeds: int
+    training_seeds: tuple[int, ...]
     runs: pd.DataFrame
     outcomes: dict[str, Outcome]
     error: Estimate | None
     errors_by_data: dict[str, Estimate | None]
+
+    @property
+    def seeds(self) -> int:
+        return len(self.training_seeds)
 
     @property
     def failures(self) -> pd.DataFrame:
@@ -85,6 +89,11 @@ class Table(NamedTuple):
     seeds: int
     lines: list[Line]
     baseline: Line | None = None
+
+    @property
+    def spans(self) -> list[tuple[int, int]]:
+        """First and last training seed of its variants, each span once."""
+        return sorted({(line.training_seeds[0], line.training_seeds[-1]) for line in self.lines})
 
 
 class RateTest(NamedTuple):

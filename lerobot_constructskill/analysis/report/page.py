@@ -32,7 +32,7 @@ MARKDOWN = "\\`*_[]|"
 WORDS = (
     *(wording.chance, wording.p_value, wording.percent, wording.rare, wording.share_range, wording.signed),
     *(wording.points, wording.points_range, wording.mean_episodes, wording.episodes_range, wording.error_range),
-    *(plural, wording.seeds),
+    *(plural, wording.seeds, wording.seed_spans),
 )
 """What templates may call as filters."""
 

@@ -83,6 +83,12 @@ def seeds(n: int) -> str:
     return plural(n, "seed")
 
 
+def seed_spans(spans: Sequence[tuple[int, int]]) -> str:
+    """ "seed 0", "seeds 0–9", "seeds 0–9 and 100–109"."""
+    noun = "seed" if len(spans) == 1 and spans[0][0] == spans[0][1] else "seeds"
+    return f"{noun} {listed([str(first) if first == last else f'{first}–{last}' for first, last in spans])}"
+
+
 def quoted(label: str) -> str:
     """A label as it stands in a sentence: in quotation marks where it has a comma of its own."""
     return f"“{label}”" if "," in label else label
