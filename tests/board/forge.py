@@ -89,19 +89,22 @@ def a_success_in_a_failures_place(root, rng):
     edit(root, change)
 
 
+def copied(rows: list[dict], rng: np.random.Generator) -> dict:
+    """Copy a success to the other training seed, and return the copy."""
+    good = placed(rows, rng)
+    (other,) = (
+        row
+        for row in rows
+        if row["training_seed"] != good["training_seed"]
+        and (row["setting"], row["evaluation_seed"]) == (good["setting"], good["evaluation_seed"])
+    )
+    other.update({name: value for name, value in good.items() if name != "training_seed"})
+    return other
+
+
 @forges(READ)
 def a_success_copied_to_the_other_training_seed(root, rng):
-    def change(rows):
-        good = placed(rows, rng)
-        (other,) = (
-            row
-            for row in rows
-            if row["training_seed"] != good["training_seed"]
-            and (row["setting"], row["evaluation_seed"]) == (good["setting"], good["evaluation_seed"])
-        )
-        other.update({name: value for name, value in good.items() if name != "training_seed"})
-
-    edit(root, change)
+    edit(root, lambda rows: copied(rows, rng))
 
 
 @forges(READ)
@@ -109,15 +112,8 @@ def a_success_copied_beyond_the_jaws_reach(root, rng):
     """The gripper asked for more than there is: other numbers, and the same actions once they are executed."""
 
     def change(rows):
-        good = placed(rows, rng)
-        (other,) = (
-            row
-            for row in rows
-            if row["training_seed"] != good["training_seed"]
-            and (row["setting"], row["evaluation_seed"]) == (good["setting"], good["evaluation_seed"])
-        )
-        other.update({name: value for name, value in good.items() if name != "training_seed"})
-        other["actions"] = [4 * one if number % 4 == 3 else one for number, one in enumerate(good["actions"])]
+        copy = copied(rows, rng)
+        copy["actions"] = [4 * one if number % 4 == 3 else one for number, one in enumerate(copy["actions"])]
 
     edit(root, change)
 

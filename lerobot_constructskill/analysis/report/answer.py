@@ -3,7 +3,7 @@
 from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings
 from lerobot_constructskill.analysis.report.wording import episodes, listed, quoted, seeds, share_range, tau
 from lerobot_constructskill.analysis.stats.comparisons import Comparison, Verdict
-from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
+from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.outcomes import Counts
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.rows import SIGHTLESS
@@ -74,13 +74,14 @@ def _best(lines: list[Line], n_episodes: int) -> str:
 
 def _placed_in(lines: list[Line]) -> str:
     """In how many seeds each placed; lines with equally many are named together."""
-    alike: dict[Counts, list[str]] = {}
+    alike: dict[tuple[Counts, Estimate], list[str]] = {}
     for line in lines:
-        alike.setdefault(line.outcomes["placed"].counts, []).append(quoted(line.label))
+        placed = line.outcomes["placed"]
+        alike.setdefault((placed.counts, placed.exact), []).append(quoted(line.label))
     return ", ".join(
         f"{listed(labels)} placed the object in {counts.met} of {seeds(counts.seeds)}{' each' * (len(labels) > 1)} "
-        f"(95 % interval {share_range(clopper_pearson(counts))})"
-        for counts, labels in alike.items()
+        f"(95 % interval {share_range(exact)})"
+        for (counts, exact), labels in alike.items()
     )
 
 

@@ -38,15 +38,15 @@ def spread(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> 
     return _estimate(float(rates.std()), _posterior(rates, rng)[1], level)
 
 
-def mean_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
+def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
     """Permutation test, two-tailed, of the difference of a's and b's mean over seeds. Arguments of `spread_p_value`.
 
     For settings in which a seed succeeds in some of its episodes, where "at least once" says little.
     """
-    return _permuted(np.mean, a, b, rng)
+    return _permuted(np.mean, a, b)
 
 
-def spread_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
+def spread_p_value(a: np.ndarray, b: np.ndarray) -> float:
     """Permutation test, two-tailed, of the difference of a's and b's standard deviation over seeds.
 
     Seeds are exchanged between the arms, so that a small p speaks against equal distributions, in their spread; for
@@ -55,12 +55,11 @@ def spread_p_value(a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> fl
 
     Args:
         a, b: share in [0, 1] of each seed, (seeds,) each.
-        rng: source of the permutations where there are too many to try all.
     """
-    return _permuted(np.std, a, b, rng)
+    return _permuted(np.std, a, b)
 
 
-def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray, rng: np.random.Generator) -> float:
+def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray) -> float:
     def difference(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
         # Rounded, or equal statistics would be told apart by their last bit.
         return np.abs(statistic(x, axis=axis) - statistic(y, axis=axis)).round(12)
@@ -68,6 +67,7 @@ def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray, rng: np.random.
     arms = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if min(map(len, arms)) < 2:
         return 1.0  # scipy refuses a single seed, which tells nothing of the others
+    rng = np.random.default_rng(0)  # of its own: the same p-value at every call, whatever else is tested
     result = permutation_test(
         arms, difference, vectorized=True, alternative="greater", n_resamples=PERMUTATIONS, rng=rng
     )
