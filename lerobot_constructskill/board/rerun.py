@@ -10,6 +10,7 @@ from lerobot_constructskill.analysis.stats.comparisons import holm
 from lerobot_constructskill.analysis.stats.spread import mean_p_value
 from lerobot_constructskill.board.protocol import RERUN_ALPHA, Setting, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
+from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
 
 
@@ -65,8 +66,17 @@ class Comparison:
 
 
 def instructions(submission: Submission, value: str) -> str:
-    """From which starts to run a submission's checkpoint anew, and how."""
+    """From which starts to run a submission's checkpoint anew, and how.
+
+    Raises:
+        InputError: it is no policy that looks, so that there is no checkpoint to run.
+    """
     declaration = submission.declaration
+    if declaration.about.observes not in OBS_TYPES:
+        raise InputError(
+            f"{declaration.about.name} observes {declaration.about.observes}: a re-run evaluates the checkpoint of a "
+            f"policy that observes {' or '.join(OBS_TYPES)}."
+        )
     first = fresh_start(submission.sha256, value)
     settings = fresh_settings(declaration.settings, first)
     lines = [f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:"]

@@ -60,6 +60,14 @@ def test_seeds_are_the_same_in_any_order_and_a_draw_is_told(submission):
     assert {name: Setting(**of) for name, of in said.items()} == fresh_settings(settings, first)
 
 
+@pytest.mark.parametrize("sees", ["privileged", "nothing"])
+def test_a_reference_has_no_checkpoint_to_run_anew(submission, sees):
+    about = replace(submission.declaration.about, observes=sees)
+    reference = replace(submission, declaration=replace(submission.declaration, about=about))
+    with pytest.raises(InputError, match=f"observes {sees}: a re-run evaluates the checkpoint of a policy that"):
+        instructions(reference, VALUE)
+
+
 def test_one_start_is_compared_by_training_seeds(submission):
     """As `brick_to_bin` has one: all its ten seeds placed, and none does when it is run anew."""
     said = replace(submission.declaration, settings={"fixed": Setting("brick_to_bin", 1)}, training_seeds=[*range(10)])
