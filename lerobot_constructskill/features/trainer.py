@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils import OBS_STATE
@@ -92,15 +93,27 @@ class FeatureTrainer:
                 save_checkpoint(policy, features, folder)
 
     def heldout_mse(
-        self, checkpoints: Sequence[Path], demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store
+        self,
+        config: FrozenViTChunkConfig,
+        checkpoints: Sequence[Path],
+        demonstrations: LeRobotDataset,
+        held_out: Sequence[int],
+        store: Store,
     ) -> list[float | None]:
         """Return each checkpoint's translation error on other demonstrations, in m2; None where they lack an input."""
-        return [self._heldout_mse(checkpoint, demonstrations, held_out, store) for checkpoint in checkpoints]
+        here = {name: getattr(config, name) for name in ("device", *self.places)}
+        return [self._heldout_mse(checkpoint, here, demonstrations, held_out, store) for checkpoint in checkpoints]
 
     def _heldout_mse(
-        self, checkpoint: Path, demonstrations: LeRobotDataset, held_out: Sequence[int], store: Store
+        self,
+        checkpoint: Path,
+        here: Mapping[str, Any],
+        demonstrations: LeRobotDataset,
+        held_out: Sequence[int],
+        store: Store,
     ) -> float | None:
-        policy = FrozenViTChunkPolicy.from_pretrained(checkpoint)
+        saved = PreTrainedConfig.from_pretrained(checkpoint)
+        policy = FrozenViTChunkPolicy.from_pretrained(checkpoint, config=replace(saved, **here))
         if policy.config.use_state and OBS_STATE not in demonstrations.meta.features:
             return None
         features = obtain_features(policy.config, demonstrations, store)

@@ -83,7 +83,7 @@ class Arm:
         env: keyword arguments of `ConstructSkillEnv`.
         evaluation: `seed` of the first episode, and how many `episodes`.
         demonstrations: what it learns from or replays, if it does.
-        validated_on: all demonstrations of its setting.
+        validated_on: all demonstrations of its setting, those that every seed would share.
         policy: settled configuration of what is trained; None for references that are not.
         training: how.
         dagger: whose rounds it is trained on beside the demonstrations, if it is.
@@ -101,6 +101,14 @@ class Arm:
     training: Training | None = None
     dagger: DaggerConfig | None = None
     elsewhere: tuple["Arm", ...] = ()
+
+    @property
+    def trained_on(self) -> Demonstrations | None:
+        """The demonstrations that are all it is trained on; none where DAgger adds rounds to them.
+
+        Of these alone the trainer's own held-out error speaks.
+        """
+        return None if self.dagger else self.demonstrations
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,16 +177,14 @@ def list_runs(study: Study) -> list[Run]:
             env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
         evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
-        common = {"setting": name, "env": env, "evaluation": evaluation}
+        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
             for seeds, drawn in _draws(study, range(count), sets):
-                of_these = common | {"validated_on": tuple(drawn.values())}
-                arm = _reference_arm(study, reference, drawn[setting.data], of_these)
+                arm = _reference_arm(study, reference, drawn[setting.data], common)
                 runs += [Run(arm, seed) for seed in seeds]
         for variant_name, variant in study.variants_in(name).items():
             for seeds, drawn in _draws(study, variant.training_seeds, sets):
-                of_these = common | {"validated_on": tuple(drawn.values())}
-                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], of_these)
+                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], common)
                 runs += [Run(arm, seed) for seed in seeds]
     return runs
 
@@ -202,6 +208,11 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
     learnt = {"demonstrations": data, "policy": policy, "training": training}
     if variant.dagger:
         rounds = _dagger_config(variant)
+        if (starts := rounds.rounds * rounds.episodes) > SEEDS_APART and study.demonstrations != SHARED:
+            raise InputError(
+                f"variants.{name}.dagger: where each training seed has demonstrations of its own, all rounds together "
+                f"may have {SEEDS_APART:,} episodes at most, not {starts:,}."
+            )
         base = f"{data.name} --seed_start={data.config.seed_start}" if data.moved else data.name
         start = rounds.seed_start + data.moved
         learnt["dagger"] = replace(rounds, base=base, seed_start=start, policy=variant.policy, training=training)

@@ -131,7 +131,7 @@ class Table:
         return {own: errors.get(run.arm.validated_on[0].name), every: json.dumps(errors)} if errors else {}
 
     def _heldout_error(self, run: Run, data: Demonstrations) -> float | None:
-        if data == run.arm.demonstrations:
+        if data == run.arm.trained_on:
             return read_facts(self.store.folder(run.checkpoint)).get("heldout_mse_m2")
         return read_error(run, data, self.store)
 

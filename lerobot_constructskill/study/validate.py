@@ -46,7 +46,7 @@ def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, De
         for arm in arms
         if arm.policy and trainer_of(arm.policy).heldout_mse
         for data in arm.validated_on
-        if data != arm.demonstrations and data not in spared
+        if data != arm.trained_on and data not in spared
     ]
 
 
@@ -62,7 +62,7 @@ def _measure(arm: Arm, runs: Sequence[Run], data: Demonstrations, store: Store, 
     with store.claim([run.heldout(data) for run in runs]) as missing:
         runs = [run for run in runs if run.heldout(data) in missing]
         checkpoints = [store.folder(run.checkpoint) for run in runs]
-        errors = trainer_of(arm.policy).heldout_mse(checkpoints, dataset, episodes, store)
+        errors = trainer_of(arm.policy).heldout_mse(arm.policy, checkpoints, dataset, episodes, store)
         for run, error in zip(runs, errors, strict=True):
             with store.writing(run.heldout(data)) as folder:
                 folder.mkdir()

@@ -11,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils import auto_select_torch_device
 
 from lerobot_constructskill.artifacts.digests import versions
+from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.training.recipe import Training
@@ -52,7 +53,7 @@ def checkpoint_artifact(
 @contextmanager
 def writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
     """A `trainers.Writer`, but for its first two arguments."""
-    with store.writing(checkpoint) as folder:
+    with store.writing(checkpoint) as folder, room_for(folder):
         yield folder
         (folder / FACTS).write_text(json.dumps(facts) + "\n")
 

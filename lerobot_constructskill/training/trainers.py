@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +18,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_constructskill.artifacts.digests import distributions_of
 from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
 from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
+
+KILLED = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+"""What ends a process from outside: somebody, or the kernel for want of memory. No policy ends itself like this."""
 
 LOADERS = 4
 """LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
@@ -38,8 +43,9 @@ class Trainer:
     packages: tuple[str, ...] = ()
     """Distributions beside LeRobot, torch and the configuration's own whose versions may show in them."""
     heldout_mse: Callable[..., list[float | None]] | None = None
-    """`(checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on episodes of
-    other demonstrations, in m2; None where they lack one of its inputs. Without it, none is validated on others."""
+    """`(config, checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on
+    episodes of other demonstrations, in m2; None where they lack one of its inputs. `config` says where things lie and
+    compute now. Without it, none is validated on others."""
 
     def seeds_together(self, config: PreTrainedConfig) -> bool:
         """Whether `fit` should get many seeds at once: they are then kept, or fail, together."""
@@ -154,6 +160,7 @@ def _call(command: list[str]) -> str:
 
     Raises:
         RuntimeError: it failed; all that it said is the exception's note.
+        MachineError: it was killed.
     """
     done = subprocess.run(
         command,
@@ -163,6 +170,9 @@ def _call(command: list[str]) -> str:
         errors="replace",
         preexec_fn=be_killed_with_parent,
     )
+    if -done.returncode in KILLED:
+        name = signal.Signals(-done.returncode).name
+        raise MachineError(f"lerobot-train was killed ({name}), for want of memory perhaps; the same command goes on.")
     if done.returncode:
         lines = done.stdout.strip().splitlines() or ["nothing"]
         error = RuntimeError(f"lerobot-train ended with status {done.returncode} and said last: {lines[-1]}")

@@ -94,6 +94,14 @@ def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
     assert validated("fixed/own/seed_1,fixed/more") == {("fixed", "own", more), ("fixed", "more", own)}
 
 
+def test_what_dagger_makes_is_validated_on_its_demonstrations_too():
+    """Its trainer's own error is of its rounds as well, which no other variant of the setting has seen."""
+    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    variants = {"cloned": Variant(policy, seeds=1), "driven": Variant(policy, seeds=1, dagger="smoke")}
+    ((arm, data),) = list_pairs(list_runs(study(variants=variants)), [])
+    assert arm.name == "driven" and data == arm.demonstrations
+
+
 def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
     policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
     variants = {
@@ -114,12 +122,16 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
     driven = [run.dagger for run in runs.values() if run.arm.name == "driven"]
     assert [plan.base.seed_start for plan in driven] == [base.seed_start for base in bases]
     assert len(set.union(*(set(plan.seeds(1)) for plan in driven))) == sum(len(plan.seeds(1)) for plan in driven)
-    for run in runs.values():
-        if run.arm.name == "a":
-            ((arm, data),) = list_pairs([run], [])
-            assert arm is run.arm and data.name == "smoke --noise.sigma=0" and data.moved == run.seed * SEEDS_APART
+    for seed in range(3):
+        measured_on = [data for _, data in list_pairs([runs[f"fixed/a/seed_{seed}"]], [])]
+        names = ["smoke", "smoke --noise.sigma=0"][seed == 0 :]  # a trainer has measured seed 0 on its own already
+        assert [(data.name, data.moved) for data in measured_on] == [(name, 0) for name in names]
     with pytest.raises(InputError, match="may take 2,002 attempts"):
         list_runs(study(settings={"fixed": Setting("smoke --episodes=1001", {})}, demonstrations="own"))
+    often = {"driven": Variant(policy, seeds=3, dagger="smoke --rounds=3 --episodes=667")}
+    list_runs(study(variants=often))
+    with pytest.raises(InputError, match=r"variants\.driven\.dagger: .* not 2,001"):
+        list_runs(study(variants=often, demonstrations="own"))
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
