@@ -49,6 +49,8 @@ class Agent(Protocol):
 class PolicyAgent:
     """A LeRobot policy between its two processors, as `lerobot-eval` runs it.
 
+    A policy that samples its actions draws them from the episode's seed and the step, whatever else runs beside it.
+
     Args:
         policy: the policy, in evaluation mode.
         preprocessor: from observations to what the policy reads.
@@ -57,6 +59,7 @@ class PolicyAgent:
 
     def __init__(self, policy: PreTrainedPolicy, preprocessor, postprocessor):
         self.policy, self.preprocessor, self.postprocessor = policy.eval(), preprocessor, postprocessor
+        self._seed = self._step = 0
 
     @classmethod
     def from_pretrained(cls, checkpoint: Path | str, device: str | None = None, **overrides: Any) -> "PolicyAgent":
@@ -98,6 +101,7 @@ class PolicyAgent:
 
     def reset(self, seed: int) -> None:
         self.policy.reset()
+        self._seed, self._step = seed, 0
 
     def act(self, observation: Observation) -> np.ndarray:
         return self.decide(self.see(observation))
@@ -110,7 +114,13 @@ class PolicyAgent:
     @torch.inference_mode()
     def decide(self, batch: dict[str, Any]) -> np.ndarray:
         """Return the action for a batch of one."""
-        return self.postprocessor(self.policy.select_action(batch)).squeeze(0).cpu().numpy()
+        (drawn,) = np.random.SeedSequence([self._seed, self._step]).generate_state(1)
+        self._step += 1
+        device = torch.device(self.policy.config.device)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(int(drawn))
+            action = self.policy.select_action(batch)
+        return self.postprocessor(action).squeeze(0).cpu().numpy()
 
 
 class Lockstep:
