@@ -58,7 +58,7 @@ ARROWS = {
     "board.submission": ("artifacts", "contract", "envs.actions", "envs.recording"),
     "board.collect": ("envs.recording", "study.rows"),
     "board.replay": ("artifacts", "envs"),
-    "board.rerun": ("analysis.stats",),
+    "board.rerun": ("analysis.stats", "contract"),
     "board.films": ("artifacts", "contract"),
     "board.entries": ("analysis.stats", "contract"),
     "board.exports": ("artifacts", "contract"),

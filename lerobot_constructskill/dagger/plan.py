@@ -1,10 +1,11 @@
 """A DAgger run before anything runs: every policy, round and data set of it, each found by what makes it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact
@@ -44,6 +45,18 @@ class Plan:
     def policy(self) -> PreTrainedConfig:
         return settle_policy(self.config.policy)
 
+    def check(self) -> None:
+        """Refuse what would only fail once a policy is trained and drives.
+
+        Raises:
+            InputError: the policy reads what the base does not show.
+        """
+        policy, drives = self.policy, self.config.rounds or self.config.eval_episodes
+        # LeRobot gives a policy that does not name its inputs all of the data set, the state among them.
+        reads = OBS_STATE in policy.input_features if policy.input_features else getattr(policy, "use_state", True)
+        if drives and reads and self.base.obs_type == "pixels":
+            raise InputError("The policy reads observation.state; choose a base with obs_type 'pixels_agent_pos'.")
+
     @property
     def task(self) -> Task:
         return get_task(self.base.task)
@@ -67,20 +80,34 @@ class Plan:
 
     def data(self, number: int) -> Artifact:
         """The demonstrations and the first `number` rounds."""
-        if number == 0:
-            return self.demonstrations
-        rounds = [self.round(past).digest for past in range(1, number + 1)]
-        return Artifact("dagger", {"demonstrations": self.demonstrations.digest, "rounds": rounds})
+        return self._chain[0][number]
 
     def checkpoint(self, number: int) -> Artifact:
         """Policy `number`."""
-        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, self.data(number).spec)
+        return self._chain[1][number]
 
     def round(self, number: int) -> Artifact:
         """The frames of a round, counted from 1, in which policy `number - 1` drives."""
+        return self._chain[2][number - 1]
+
+    @cached_property
+    def _chain(self) -> tuple[list[Artifact], list[Artifact], list[Artifact]]:
+        """Data sets, policies and rounds in order, each found by those before it."""
+        data, policies, rounds = [self.demonstrations], [], []
+        for number in range(1, self.config.rounds + 1):
+            policies.append(self._trained_on(data[-1]))
+            rounds.append(self._driven_by(policies[-1], number))
+            digests = [driven.digest for driven in rounds]
+            data.append(Artifact("dagger", {"demonstrations": self.demonstrations.digest, "rounds": digests}))
+        return data, [*policies, self._trained_on(data[-1])], rounds
+
+    def _trained_on(self, data: Artifact) -> Artifact:
+        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, data.spec)
+
+    def _driven_by(self, policy: Artifact, number: int) -> Artifact:
         facts = {
             "number": number,
-            "learner": self.checkpoint(number - 1).digest,
+            "learner": policy.digest,
             "beta": self.config.beta(number),
             "seeds": [self.seeds(number).start, self.config.episodes],
             "expert": vars(self.base.expert),
@@ -107,8 +134,3 @@ class Plan:
     @cached_property
     def _versions(self) -> dict[str, str]:
         return versions(*ACTING, *packages_of(self.policy))
-
-
-def named(config: DaggerConfig, **changes: Any) -> Plan:
-    """The plan of a configuration with some fields otherwise, such as another training seed."""
-    return Plan(replace(config, **changes))

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
@@ -105,8 +104,6 @@ def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: S
     here = {name: getattr(plan.policy, name) for name in trainer_of(plan.policy).places}
     checkpoint = store.folder(plan.checkpoint(policy))
     learner = PolicyAgent.from_pretrained(checkpoint, plan.policy.device, **here)
-    if OBS_STATE in learner.policy.config.input_features and plan.base.obs_type == "pixels":
-        raise InputError("The policy reads observation.state; choose a base with obs_type 'pixels_agent_pos'.")
     expert = make_expert(plan.task, plan.base.expert)
     yield from drive_all(learner, expert, plan.env, seeds, drive, plan.config.together, plan.config.workers)
 

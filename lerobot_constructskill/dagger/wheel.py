@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED, GRIPPER_OPEN, get_task
+from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import EXPERT, LEARNER
 from lerobot_constructskill.demos.demonstrate import came_of_it, decided, seen
 from lerobot_constructskill.demos.expert import Advice, Expert, PrivilegedState
+from lerobot_constructskill.envs.actions import action_bounds
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
@@ -72,11 +73,7 @@ class Episode:
 
 def as_executed(action: np.ndarray) -> np.ndarray:
     """What the environment makes of an action: within its bounds."""
-    high = np.full(len(action), ACTION_SCALE, dtype=np.float32)
-    high[-1] = GRIPPER_OPEN
-    low = -high
-    low[-1] = GRIPPER_CLOSED
-    return np.clip(np.asarray(action, dtype=np.float32), low, high)
+    return np.clip(np.asarray(action, dtype=np.float32), *action_bounds(len(action)))
 
 
 def drive_all(

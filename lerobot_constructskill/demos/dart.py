@@ -58,7 +58,7 @@ def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.n
         (3, 3) in m2
 
     Raises:
-        ValueError: no episode has an error, or alpha is not above 0.
+        ValueError: no episode has an error, or alpha is not above 0, or nothing to scale to it.
     """
     errors = [error for error in errors if len(error)]
     if not errors:
@@ -68,5 +68,7 @@ def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.n
     covariance = np.mean([error.T @ error / len(error) for error in errors], axis=0)
     if alpha is None:
         return covariance
+    if not np.trace(covariance) > 0:
+        raise InputError("The policy has no error on the held-out episodes, so there is nothing to scale to alpha.")
     length = np.mean([len(error) for error in errors])
     return covariance * alpha / (length * np.trace(covariance))

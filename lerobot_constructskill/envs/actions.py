@@ -4,7 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER, ROTATION, ROTATION_SIGN, TRANSLATION
+from lerobot_constructskill.contract import (
+    ACTION_SCALE,
+    GRIPPER,
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    ROTATION,
+    ROTATION_SIGN,
+    TRANSLATION,
+)
 
 CHANNEL_SCALE = {
     **dict.fromkeys(TRANSLATION, ACTION_SCALE),
@@ -16,6 +24,15 @@ replay bit for bit."""
 
 MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
+
+
+def action_bounds(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and highest action of `count` channels, the gripper last, (A,) float32 in metres or radians."""
+    high = np.full(count, ACTION_SCALE, dtype=np.float32)
+    high[-1] = GRIPPER_OPEN
+    low = -high
+    low[-1] = GRIPPER_CLOSED
+    return low, high
 
 
 def within_reach(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:

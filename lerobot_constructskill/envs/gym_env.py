@@ -12,16 +12,13 @@ from gymnasium import spaces
 
 from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
-    ACTION_SCALE,
     FPS,
-    GRIPPER_CLOSED,
-    GRIPPER_OPEN,
     IMAGE_SIZE,
     OBS_TYPES,
     STATE_NAMES,
     get_task,
 )
-from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, within_reach
+from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, within_reach
 from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.perturbations import Perturbation
@@ -94,7 +91,7 @@ class ConstructSkillEnv(gym.Env):
         self._steps = 0
         self._recording = None
         self.observation_space = self._make_observation_space()
-        self.action_space = self._make_action_space()
+        self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
 
     def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -102,13 +99,6 @@ class ConstructSkillEnv(gym.Env):
         if self.obs_type == "pixels_agent_pos":
             space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
         return spaces.Dict(space)
-
-    def _make_action_space(self) -> spaces.Box:
-        high = np.full(len(self._row.action_names), ACTION_SCALE, dtype=np.float32)
-        high[-1] = GRIPPER_OPEN
-        low = -high
-        low[-1] = GRIPPER_CLOSED
-        return spaces.Box(low, high, dtype=np.float32)
 
     # Gymnasium
 

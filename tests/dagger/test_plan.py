@@ -1,5 +1,6 @@
 """What a DAgger run's policies, rounds and data sets depend on, found without running any of them."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -15,6 +16,7 @@ from lerobot_constructskill.study.spec import Setting, Study, Variant
 from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
+FROZEN_VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
 CONFIG = DaggerConfig("local/set", ACT, base="smoke", rounds=3)
 
 
@@ -69,6 +71,20 @@ def test_seeds_of_rounds_never_meet():
     plan = Plan(CONFIG)
     seeds = [seed for number in (1, 2, 3) for seed in plan.seeds(number)]
     assert len(set(seeds)) == 3 * CONFIG.episodes and min(seeds) > plan.base.seed_start + plan.base.episodes
+
+
+def test_a_hundred_rounds_are_planned_as_soon_as_three():
+    plan = Plan(replace(CONFIG, rounds=100))
+    assert plan.round(3).digest == made()[1][2] and len({plan.data(number).digest for number in range(101)}) == 101
+
+
+@pytest.mark.parametrize("policy, reads", [(ACT, True), (FROZEN_VIT, False), (FROZEN_VIT | {"use_state": True}, True)])
+def test_what_a_policy_reads_the_base_has_to_show(policy, reads):
+    Plan(replace(CONFIG, policy=policy, base="smoke --obs_type=pixels_agent_pos")).check()
+    Plan(replace(CONFIG, policy=policy, rounds=0)).check()
+    refused = pytest.raises(InputError, match="reads observation.state") if reads else nullcontext()
+    with refused:
+        Plan(replace(CONFIG, policy=policy)).check()
 
 
 def test_labels_that_are_not_the_experts_are_refused():

@@ -80,7 +80,10 @@ def test_alpha_is_the_squared_error_of_an_episode():
     np.testing.assert_allclose(covariance / np.trace(covariance), (c := fit_covariance(errors)) / np.trace(c))
 
 
-@pytest.mark.parametrize("errors, alpha, word", [([], None, "no frame"), ([np.ones((2, 3))], 0.0, "alpha")])
+@pytest.mark.parametrize(
+    "errors, alpha, word",
+    [([], None, "no frame"), ([np.ones((2, 3))], 0.0, "alpha"), ([np.zeros((2, 3))], 1.0, "nothing to scale")],
+)
 def test_nothing_to_fit_is_told(errors, alpha, word):
     with pytest.raises(ValueError, match=word):
         fit_covariance(errors, alpha)
