@@ -48,8 +48,8 @@ def roll_out(
 ) -> Iterator[tuple[int, Rollout]]:
     """Run every agent through one episode per seed, in `ConstructSkillEnv(**env_kwargs)`.
 
-    An agent's episodes are those of `lerobot-eval` with the same seeds and one environment, step for step. An agent
-    that raises has failed; the others go on.
+    An agent's episodes are those of `lerobot-eval` with the same seeds and one environment, step for step, but for a
+    policy that samples. An agent that raises has failed; the others go on.
 
     Args:
         n_workers: simulator processes; one per core by default.
