@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact
@@ -16,7 +15,7 @@ from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse_named
-from lerobot_constructskill.training.checkpoints import LEARNING, checkpoint_artifact, settle_policy
+from lerobot_constructskill.training.checkpoints import LEARNING, check_inputs, checkpoint_artifact, settle_policy
 from lerobot_constructskill.training.trainers import packages_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien", "av")
@@ -28,7 +27,8 @@ class Plan:
     """What a configuration asks for. Policy 0 learns from the demonstrations, policy k from those of k rounds too.
 
     Raises:
-        InputError: the base cannot be read, its labels are not the expert's, or nothing can be a policy.
+        InputError: the base cannot be read, its labels are not the expert's, nothing can be a policy, or the policy
+            is to drive and reads what the base does not show.
     """
 
     config: DaggerConfig
@@ -45,18 +45,6 @@ class Plan:
     def policy(self) -> PreTrainedConfig:
         return settle_policy(self.config.policy)
 
-    def check(self) -> None:
-        """Refuse what would only fail once a policy is trained and drives.
-
-        Raises:
-            InputError: the policy reads what the base does not show.
-        """
-        policy, drives = self.policy, self.config.rounds or self.config.eval_episodes
-        # LeRobot gives a policy that does not name its inputs all of the data set, the state among them.
-        reads = OBS_STATE in policy.input_features if policy.input_features else getattr(policy, "use_state", True)
-        if drives and reads and self.base.obs_type == "pixels":
-            raise InputError("The policy reads observation.state; choose a base with obs_type 'pixels_agent_pos'.")
-
     @property
     def task(self) -> Task:
         return get_task(self.base.task)
@@ -64,6 +52,7 @@ class Plan:
     @cached_property
     def env(self) -> dict[str, Any]:
         """Keywords of `ConstructSkillEnv` in every round, what they leave to the machine written out."""
+        check_inputs(self.policy, self.base.obs_type)
         light_robot, backend = resolve_rendering(self.base.light_robot)
         length = self.config.max_steps or self.task.horizon
         return {

@@ -24,6 +24,7 @@ from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import SHARED, Study, Variant
 from lerobot_constructskill.training.checkpoints import (
     LEARNING,
+    check_inputs,
     checkpoint_artifact,
     decode_policy,
     settle_policy,
@@ -203,6 +204,7 @@ def _draws(
 def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
         policy = settle_policy(variant.policy)
+        check_inputs(policy, common["env"]["obs_type"])
         others = settled_elsewhere(variant.policy)
     training = _training_of(study, common["setting"], name, variant)
     learnt = {"demonstrations": data, "policy": policy, "training": training}

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils import auto_select_torch_device
+from lerobot.utils import OBS_STATE, auto_select_torch_device
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import packages_of, policy_spec, trainer_of
@@ -39,6 +40,18 @@ def settled_elsewhere(fields: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The same fields for each other kind of machine, with that written out which it would settle otherwise."""
     config = decode_policy(fields)
     return [{**fields, **others} for others in trainer_of(config).settled_elsewhere(config)]
+
+
+def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
+    """Refuse a policy that reads what it would not be shown where it acts.
+
+    Raises:
+        InputError: it reads the state, and observations have pictures alone.
+    """
+    # LeRobot gives a policy that does not name its inputs all of the data set, the state among them.
+    reads_state = OBS_STATE in policy.input_features if policy.input_features else getattr(policy, "use_state", True)
+    if reads_state and obs_type == "pixels":
+        raise InputError("The policy reads observation.state; where it acts, obs_type has to be 'pixels_agent_pos'.")
 
 
 def checkpoint_artifact(

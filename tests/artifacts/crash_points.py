@@ -87,7 +87,8 @@ def scenario_study(root: Path) -> None:
     execute._train = lambda job, runs: {}
     Store.note = lambda *_: None  # a log says when
     policy = {"type": "act", "pretrained_backbone_weights": None}
-    study = Study("x", {"s": Setting("smoke")}, {"a": Variant(policy, seeds=3)}, {"no_op": 1, "random": 2})
+    setting = Setting("smoke", {"obs_type": "pixels_agent_pos"})
+    study = Study("x", {"s": setting}, {"a": Variant(policy, seeds=3)}, {"no_op": 1, "random": 2})
     run_study(study, "", root / "study", Store(root / "store"), Options(together=2))
     (root / "study" / "provenance.json").unlink(missing_ok=True)  # it says how long it took
     (root / "study" / "timings.jsonl").unlink(missing_ok=True)

@@ -17,7 +17,8 @@ from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
 FROZEN_VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
-CONFIG = DaggerConfig("local/set", ACT, base="smoke", rounds=3)
+SEEN = {"obs_type": "pixels_agent_pos"}
+CONFIG = DaggerConfig("local/set", ACT, base="smoke --obs_type=pixels_agent_pos", rounds=3)
 
 
 def made(**fields):
@@ -46,7 +47,7 @@ def test_more_rounds_go_on_where_fewer_ended():
     "fields",
     [
         {"seed": 1},
-        {"base": "smoke --episodes=5"},
+        {"base": "smoke --obs_type=pixels_agent_pos --episodes=5"},
         {"policy": ACT | {"dim_model": 64}},
         {"training": Training(epochs=1)},
     ],
@@ -80,11 +81,12 @@ def test_a_hundred_rounds_are_planned_as_soon_as_three():
 
 @pytest.mark.parametrize("policy, reads", [(ACT, True), (FROZEN_VIT, False), (FROZEN_VIT | {"use_state": True}, True)])
 def test_what_a_policy_reads_the_base_has_to_show(policy, reads):
-    Plan(replace(CONFIG, policy=policy, base="smoke --obs_type=pixels_agent_pos")).check()
-    Plan(replace(CONFIG, policy=policy, rounds=0)).check()
-    refused = pytest.raises(InputError, match="reads observation.state") if reads else nullcontext()
-    with refused:
-        Plan(replace(CONFIG, policy=policy)).check()
+    _ = Plan(replace(CONFIG, policy=policy)).round(1)
+    unseen = replace(CONFIG, policy=policy, base="smoke")
+    _ = Plan(replace(unseen, rounds=0)).checkpoint(0)
+    for drives in (lambda: Plan(unseen).round(1), lambda: Plan(replace(unseen, rounds=0)).evaluation(0)):
+        with pytest.raises(InputError, match="reads observation.state") if reads else nullcontext():
+            drives()
 
 
 def test_labels_that_are_not_the_experts_are_refused():
@@ -99,12 +101,12 @@ def test_every_shipped_configuration_makes_a_plan(name):
 
 
 def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives():
-    variants = {"driven": Variant(ACT, seeds=2, dagger="smoke"), "cloned": Variant(ACT, seeds=1)}
+    variants = {"driven": Variant(FROZEN_VIT, seeds=2, dagger="smoke"), "cloned": Variant(FROZEN_VIT, seeds=1)}
     study = Study("x", {"fixed": Setting("smoke")}, variants, training=Training(epochs=3))
     first, second, cloned = list_runs(study)
     config = parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", "smoke"))
     for run in (first, second):
-        plan = Plan(replace(config, policy=ACT, training=Training(epochs=3), seed=run.seed))
+        plan = Plan(replace(config, policy=FROZEN_VIT, training=Training(epochs=3), seed=run.seed))
         assert run.checkpoint.digest == plan.checkpoint(config.rounds).digest
     assert cloned.checkpoint.digest == first.dagger.checkpoint(0).digest
     assert first.checkpoint.digest != second.checkpoint.digest
@@ -112,6 +114,6 @@ def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives
 
 def test_a_studys_rounds_begin_with_the_variants_own_demonstrations():
     driven = Variant(ACT, seeds=1, data="--episodes=1", dagger="smoke --rounds=2")
-    (run,) = list_runs(Study("x", {"fixed": Setting("fast")}, {"driven": driven}))
+    (run,) = list_runs(Study("x", {"fixed": Setting("fast", SEEN)}, {"driven": driven}))
     assert (run.dagger.base.episodes, run.dagger.base.noise.sigma, run.dagger.config.rounds) == (1, 0.01, 2)
     assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1"

@@ -27,13 +27,15 @@ from lerobot_constructskill.training.checkpoints import FACTS
 from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
-"""A policy that needs no weights from anywhere."""
+"""A policy that needs no weights from anywhere; it reads the state."""
+
+ENV = {"episode_length": 8, "obs_type": "pixels_agent_pos"}
 
 
 def study(**fields) -> Study:
     given = {
         "name": "x",
-        "settings": {"fixed": Setting("smoke", {"episode_length": 8})},
+        "settings": {"fixed": Setting("smoke", ENV)},
         "variants": {"a": Variant(ACT, seeds=3), "b": Variant(ACT | {"dim_model": 64}, seeds=2)},
         "references": {"no_op": 1, "replay": 1},
         "episodes": 2,
@@ -74,7 +76,7 @@ def test_thirty_seeds_after_ten_are_twenty_runs():
 def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
     frozen_vit = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
     own, more, most = "smoke", "smoke --episodes=4", "smoke --episodes=8"
-    settings = {"fixed": Setting("smoke", {"episode_length": 8}), "alone": Setting("fast", {"episode_length": 8})}
+    settings = {"fixed": Setting("smoke", ENV), "alone": Setting("fast", ENV)}
     variants = {
         "own": Variant(frozen_vit, seeds=2, settings=["fixed"]),
         "more": Variant(frozen_vit, seeds=2, data="--episodes=4", settings=["fixed"]),
@@ -127,7 +129,7 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
         names = ["smoke", "smoke --noise.sigma=0"][seed == 0 :]  # a trainer has measured seed 0 on its own already
         assert [(data.name, data.moved) for data in measured_on] == [(name, 0) for name in names]
     with pytest.raises(InputError, match="may take 2,002 attempts"):
-        list_runs(study(settings={"fixed": Setting("smoke --episodes=1001", {})}, demonstrations="own"))
+        list_runs(study(settings={"fixed": Setting("smoke --episodes=1001", ENV)}, demonstrations="own"))
     often = {"driven": Variant(policy, seeds=3, dagger="smoke --rounds=3 --episodes=667")}
     list_runs(study(variants=often))
     with pytest.raises(InputError, match=r"variants\.driven\.dagger: .* not 2,001"):
@@ -153,8 +155,8 @@ def test_names_labels_and_how_a_study_is_run_change_no_run():
     [
         {"episodes": 3},
         {"eval_seed": 7},
-        {"settings": {"fixed": Setting("smoke", {"episode_length": 9})}},
-        {"settings": {"fixed": Setting("smoke", {"episode_length": 8, "perturb": "light=1"})}},
+        {"settings": {"fixed": Setting("smoke", ENV | {"episode_length": 9})}},
+        {"settings": {"fixed": Setting("smoke", ENV | {"perturb": "light=1"})}},
     ],
     ids=str,
 )
@@ -183,7 +185,7 @@ def test_an_edited_generator_file_runs_exactly_what_depends_on_it(tmp_path):
     paths = [tmp_path / "one.yaml", tmp_path / "two.yaml"]
     for path in paths:
         path.write_text("task: brick_to_bin\nepisodes: 2\n")
-    settings = {path.stem: Setting(str(path), {"episode_length": 8}) for path in paths}
+    settings = {path.stem: Setting(str(path), ENV) for path in paths}
     of = study(settings=settings, variants={"a": Variant(ACT, seeds=1)}, references={"no_op": 1, "replay": 1})
     before = digests(of)
     paths[0].write_text("task: brick_to_bin\nepisodes: 2\nnoise: {sigma: 0.02}\n# and a comment\n")
@@ -197,7 +199,7 @@ def test_a_moved_generator_file_runs_nothing(tmp_path):
     first.write_text("task: brick_to_bin\nepisodes: 2\n")
     moved.parent.mkdir()
     moved.write_text("# moved\nepisodes: 2\ntask: brick_to_bin\nnoise: {sigma: 0.01}\nlabels: clean\n")
-    one, other = (study(settings={"fixed": Setting(str(path), {"episode_length": 8})}) for path in (first, moved))
+    one, other = (study(settings={"fixed": Setting(str(path), ENV)}) for path in (first, moved))
     assert not changed(one, other)
 
 
@@ -211,7 +213,7 @@ def test_flags_over_a_set_are_the_set_that_a_file_with_these_fields_makes(tmp_pa
 
 def test_a_variants_flags_go_over_the_set_of_each_setting():
     flags = "--noise.sigma=0 --episodes=3"
-    settings = {name: Setting(name, {"episode_length": 8}) for name in ("smoke", "fast")}
+    settings = {name: Setting(name, ENV) for name in ("smoke", "fast")}
     spelt = {f"on_{name}": Variant(ACT, 1, data=f"{name} {flags}", settings=[name]) for name in settings}
     once = study(settings=settings, references={}, variants={"a": Variant(ACT, 1, data=flags)})
     both = study(settings=settings, references={}, variants=spelt)
@@ -220,7 +222,7 @@ def test_a_variants_flags_go_over_the_set_of_each_setting():
 
 
 def test_a_variants_recipe_goes_over_its_settings_and_that_over_the_studys():
-    settings = {"few": Setting("smoke", training={"epochs": 96, "batch_size": 32}), "many": Setting("smoke")}
+    settings = {"few": Setting("smoke", ENV, training={"epochs": 96, "batch_size": 32}), "many": Setting("smoke", ENV)}
     variants = {"a": Variant(ACT, 1), "b": Variant(ACT, 1, training={"batch_size": 8})}
     of = study(settings=settings, variants=variants, references={}, training=Training(epochs=12))
     found = {run.id: (run.arm.training.epochs, run.arm.training.batch_size) for run in list_runs(of)}
@@ -252,7 +254,9 @@ def test_two_studies_share_the_runs_that_they_share(tmp_path):
 
 def test_a_whole_study_runs_nothing_and_its_table_is_in_the_studys_order(tmp_path):
     of = study(
-        settings={name: Setting("smoke", {"episode_length": length}) for name, length in (("second", 8), ("first", 9))}
+        settings={
+            name: Setting("smoke", ENV | {"episode_length": length}) for name, length in (("second", 8), ("first", 9))
+        }
     )
     table = make_all(of, tmp_path)  # nothing to run: neither data nor weights exist here
     rows = read_rows(tmp_path / "x" / "rows.parquet")
@@ -405,7 +409,7 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"variants": {"no_op": Variant(ACT)}}, "name of two things"),
         (
             {
-                "settings": {"fixed": Setting("smoke"), "fixed-a": Setting("smoke")},
+                "settings": {"fixed": Setting("smoke", ENV), "fixed-a": Setting("smoke", ENV)},
                 "variants": {"a-b": Variant(ACT), "b": Variant(ACT)},
             },
             "both 'fixed-a-b' when joined",
@@ -433,8 +437,9 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"references": {"random": 0}}, "references.random: seeds must be a whole number from 1"),
         ({"episodes": 0}, "episodes must be a whole number from 1"),
         ({"eval_seed": -1}, "eval_seed must be a whole number from 0"),
+        ({"settings": {"fixed": Setting("smoke", {"episode_length": 8})}}, "variants.a.policy: .*obs_type"),
         ({"settings": {"fixed": Setting("smoke", {"task": "brick"})}}, "settings.fixed.env: Unknown task 'brick'"),
-        ({"settings": {"fixed": Setting("smoke", training={"epoch": 5})}}, "settings.fixed.training: .*epoch"),
+        ({"settings": {"fixed": Setting("smoke", ENV, training={"epoch": 5})}}, "settings.fixed.training: .*epoch"),
         ({"settings": {"fixed": Setting("smoke", {"foo": 1})}}, "settings.fixed.env: .*foo"),
         ({"settings": {"fixed": Setting("smoke", {"episode_length": -5})}}, "settings.fixed.env: episode_length"),
         ({"settings": {"fixed": Setting("smoke", {"task": "bins"})}}, "settings.fixed.env: .*bins"),
