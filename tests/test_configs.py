@@ -14,6 +14,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill import presets
+from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
@@ -54,8 +55,8 @@ def test_a_precise_set_is_the_everyday_one_with_noise_to_its_end(path):
     everyday = generate_config(CONFIGS / "generate" / "fast_wrist.yaml")
     noise = replace(everyday.noise, release_sigma=0.003)
     precise = replace(everyday, task=path.stem, noise=noise, video="lossless", max_steps=500)
-    precise = replace(precise, max_failures=3.0 if path.stem == "brick_to_bin_3mm" else 1.0)
-    assert generate_config(path) == precise
+    failures = {"brick_to_bin_3mm": 3.0}.get(path.stem, everyday.max_failures)
+    assert generate_config(path) == replace(precise, max_failures=failures)
 
 
 @pytest.mark.parametrize("path", [path for path in GENERATE if path.stem.endswith("noise_free")], ids=lambda p: p.stem)
@@ -136,6 +137,18 @@ def test_the_papers_study_holds_its_52_runs():
     assert set(combinations(backbones, 2)) <= {
         pair for a, b in config.analysis.comparisons for pair in ((a, b), (b, a))
     }
+
+
+def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():
+    precise, ladder = (
+        draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[]).study for name in ("precise", "ladder")
+    )
+    assert (ladder.variants, ladder.training) == (precise.variants, precise.training)
+    for name, setting in SUITES["ladder"].settings.items():
+        fields = ladder.settings[name].env
+        assert (fields["task"], fields["episode_length"]) == (setting.task, setting.episode_length)
+        assert range(ladder.eval_seed, ladder.eval_seed + ladder.episodes) == setting.starts
+    assert ladder.settings.keys() == SUITES["ladder"].settings.keys()
 
 
 def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites():

@@ -237,6 +237,7 @@ def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mappin
         with _inside(f"references.{name}"):
             fields = {**variant.policy, **reference.policy}
             policies = [settle_policy(one) for one in (fields, *settled_elsewhere(fields))]
+            check_inputs(policies[0], common["env"]["obs_type"])
         training = _training_of(study, common["setting"], base, variant)
         here, *elsewhere = [replace(arm, demonstrations=data, policy=one, training=training) for one in policies]
         return replace(here, elsewhere=tuple(elsewhere))

@@ -17,8 +17,9 @@ from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
 FROZEN_VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
-SEEN = {"obs_type": "pixels_agent_pos"}
-CONFIG = DaggerConfig("local/set", ACT, base="smoke --obs_type=pixels_agent_pos", rounds=3)
+SEEN = "smoke --obs_type=pixels_agent_pos"
+"""Demonstrations that show the state, which ACT reads."""
+CONFIG = DaggerConfig("local/set", ACT, base=SEEN, rounds=3)
 
 
 def made(**fields):
@@ -47,7 +48,7 @@ def test_more_rounds_go_on_where_fewer_ended():
     "fields",
     [
         {"seed": 1},
-        {"base": "smoke --obs_type=pixels_agent_pos --episodes=5"},
+        {"base": f"{SEEN} --episodes=5"},
         {"policy": ACT | {"dim_model": 64}},
         {"training": Training(epochs=1)},
     ],
@@ -114,6 +115,6 @@ def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives
 
 def test_a_studys_rounds_begin_with_the_variants_own_demonstrations():
     driven = Variant(ACT, seeds=1, data="--episodes=1", dagger="smoke --rounds=2")
-    (run,) = list_runs(Study("x", {"fixed": Setting("fast", SEEN)}, {"driven": driven}))
+    (run,) = list_runs(Study("x", {"fixed": Setting("fast", {"obs_type": "pixels_agent_pos"})}, {"driven": driven}))
     assert (run.dagger.base.episodes, run.dagger.base.noise.sigma, run.dagger.config.rounds) == (1, 0.01, 2)
     assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1"

@@ -399,6 +399,10 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
     assert not untrained.arm.policy.backbone_pretrained and seeing.arm.policy.backbone_pretrained
     with pytest.raises(InputError, match="'blind' needs a variant whose policy has blind"):
         list_runs(study(references={"blind": 1}))
+    unseen = {"fixed": Setting("smoke", ENV), "pixels": Setting("smoke", {"episode_length": 8})}
+    stateful = {"tiny": Variant(tiny | {"use_state": True}, 1, settings=["fixed"])}
+    with pytest.raises(InputError, match="references.blind: .*obs_type"):
+        list_runs(study(settings=unseen, variants=stateful, references={"blind": 1}))
 
 
 @pytest.mark.parametrize(
