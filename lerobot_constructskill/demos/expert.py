@@ -45,6 +45,16 @@ class PrivilegedState:
         w, x, y, z = self.tcp_pose[3:]
         return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
 
+    @property
+    def rim(self) -> float:
+        """Height of the receptacle's rim."""
+        return self.bin_position[2] + self.bin_interior[2] / 2
+
+    @property
+    def floor(self) -> float:
+        """Height of what lies in the receptacle."""
+        return self.bin_position[2] - self.bin_interior[2] / 2
+
 
 @dataclass(frozen=True)
 class Progress:

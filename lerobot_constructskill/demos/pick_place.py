@@ -111,9 +111,8 @@ class PickPlaceExpert(Memoryless):
 
     def _release_point(self, state: PrivilegedState) -> np.ndarray:
         """Above the bin's centre, the object's underside `release_clearance` above the rim."""
-        rim = state.bin_position[2] + state.bin_interior[2] / 2
         below_tcp = state.object_size[2] - self.config.finger_depth
-        return np.array([*state.bin_position[:2], rim + self.config.release_clearance + below_tcp])
+        return np.array([*state.bin_position[:2], state.rim + self.config.release_clearance + below_tcp])
 
 
 def _within_reach(point: np.ndarray) -> np.ndarray:

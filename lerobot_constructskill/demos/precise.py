@@ -83,7 +83,7 @@ class PreciseExpert(PickPlaceExpert):
 
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
         """From the object's centre to the point where its underside is `release_clearance` above the rim, (3,)."""
-        above = _rim(state) + self.config.release_clearance + state.object_size[2] / 2
+        above = state.rim + self.config.release_clearance + state.object_size[2] / 2
         return np.array([*state.bin_position[:2], above]) - state.object_pose[:3]
 
     def _release(self, state: PrivilegedState) -> np.ndarray:
@@ -100,7 +100,7 @@ class PreciseExpert(PickPlaceExpert):
 
     def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
         """How fast to lower, 0 to 1: not at all outside a funnel over the opening, and gradually from its wall on."""
-        gap = _underside(state) - _rim(state)
+        gap = _underside(state) - state.rim
         if gap < -INSERTED:
             return 1.0
         accepted = np.clip(_play(state) / 2, FINEST, COARSEST) + FUNNEL * max(gap, 0)
@@ -110,14 +110,13 @@ class PreciseExpert(PickPlaceExpert):
 
     def _is_there(self, stance: Stance) -> bool:
         state = stance.state
-        floor = state.bin_position[2] - state.bin_interior[2] / 2
         is_over = _is_over_opening(state, self._carry_error(state))
-        return bool(stance.stands and is_over and stance.underside < floor + SEATED)
+        return bool(stance.stands and is_over and stance.underside < state.floor + SEATED)
 
     def _is_at_receptacle(self, stance: Stance) -> bool:
         """RELEASE aligns above the opening; an object that has come down beside it rises again."""
         state, error = stance.state, self._carry_error(stance.state)
-        if stance.underside < _rim(state):
+        if stance.underside < state.rim:
             return _is_over_opening(state, error)
         return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
 
@@ -205,11 +204,6 @@ def _is_over_opening(state: PrivilegedState, error: np.ndarray) -> bool:
     return bool((abs(error[:2]) < np.maximum(_play(state), COARSEST)).all())
 
 
-def _rim(state: PrivilegedState) -> float:
-    return state.bin_position[2] + state.bin_interior[2] / 2
-
-
 def _lowest(state: PrivilegedState, finger_depth: float) -> float:
     """Lowest height of the object's underside, in metres: on the floor, or where the fingers would meet the rim."""
-    floor = state.bin_position[2] - state.bin_interior[2] / 2
-    return max(floor, _rim(state) + TIP_CLEARANCE - (state.object_size[2] - finger_depth))
+    return max(state.floor, state.rim + TIP_CLEARANCE - (state.object_size[2] - finger_depth))

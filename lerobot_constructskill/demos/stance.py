@@ -68,7 +68,7 @@ class Stance:
 
     @property
     def rim(self) -> float:
-        return float(self.state.bin_position[2] + self.state.bin_interior[2] / 2)
+        return float(self.state.rim)
 
     @property
     def width(self) -> float:
