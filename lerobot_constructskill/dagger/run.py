@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import held_out
@@ -66,8 +64,6 @@ def run_dagger(plan: Plan, store: Store, root: Path, tell: Callable[[Line], None
         InputError: nothing can be made of a field.
         OSError: the disk is full, this machine cannot render, or a process died.
     """
-    # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
-    torch.set_flush_denormal(True)
     lines = []
     with staged(root) as folder:
         for line in _lines(plan, store):

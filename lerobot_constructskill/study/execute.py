@@ -12,7 +12,6 @@ from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
 from functools import partial
 from pathlib import Path
 
-import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
@@ -64,8 +63,6 @@ def make_runs(job: Job) -> Iterator[Run]:
 
     A run that fails has a folder as well: one row that says why, and a log with the traceback.
     """
-    # Sharp keypoints underflow, which slows training to a fifth. Threads take the setting over when they are made.
-    torch.set_flush_denormal(True)
     with job.store.claim([run.artifact for run in job.runs]) as claimed:
         yield from (run for run in job.runs if run.artifact not in claimed)
         runs = [run for run in job.runs if run.artifact in claimed]

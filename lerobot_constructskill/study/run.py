@@ -23,6 +23,7 @@ from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import seconds_by_stage
 from lerobot_constructskill.study.validate import validate
+from lerobot_constructskill.training.trainers import flush_denormals
 
 
 def run_study(study: Study, text: str, root: Path, store: Store, options: Options) -> Table:
@@ -37,6 +38,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         InputError: nothing can be run with a field of the study, or no run is called as `options.only` says.
         OSError: a simulator's process died, or another thing that is no run's fault.
     """
+    flush_denormals()
     runs = list_runs(study)
     chosen = choose(runs, options.only)
     with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
@@ -105,6 +107,7 @@ def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
 def _make_all(job: Job) -> list[Run]:
     from lerobot_constructskill.lerobot_internals import register_third_party_plugins
 
+    flush_denormals()
     register_third_party_plugins()  # another machine knows neither our policy nor other packages' yet
     return list(make_runs(job))
 

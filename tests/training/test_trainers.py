@@ -1,5 +1,7 @@
 """A training that ends from outside is no result of a policy."""
 
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -38,3 +40,31 @@ def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, m
         raise RuntimeError("SafetensorError: os error 28")
     monkeypatch.undo()
     assert not store.has(made)
+
+
+ALL_THREADS_FLUSH = """
+import os, sys, torch
+import lerobot_constructskill.{module} as module
+
+def look(*arguments):
+    smallest = torch.full((50_000, 40), 1e-20) @ torch.full((40, 64), 1e-20)
+    os._exit(0 if torch.get_num_threads() == 2 and (smallest == 0).all() else 7)
+
+module.{first} = look
+from lerobot_constructskill.scripts.{command} import main
+main()
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "module", "first", "flags"),
+    [
+        ("study", "study.run", "make_runs", ["smoke", "--root=study"]),
+        ("dagger", "dagger.run", "_lines", ["smoke", "--root=dagger", "--repo_id=local/driven"]),
+    ],
+)
+def test_when_work_begins_no_thread_computes_with_denormal_numbers(command, module, first, flags, tmp_path):
+    script = ALL_THREADS_FLUSH.format(command=command, module=module, first=first)
+    run = [sys.executable, "-c", script, *flags, "--store=store"]
+    subprocess.run(run, check=True, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "2"})
