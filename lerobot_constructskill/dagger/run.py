@@ -18,7 +18,7 @@ from lerobot_constructskill.dagger.rounds import obtain_evaluation, obtain_round
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import trainer_of
+from lerobot_constructskill.training.trainers import flush_denormals, trainer_of
 
 ROUNDS = "rounds.json"
 
@@ -64,6 +64,7 @@ def run_dagger(plan: Plan, store: Store, root: Path, tell: Callable[[Line], None
         InputError: nothing can be made of a field.
         OSError: the disk is full, this machine cannot render, or a process died.
     """
+    flush_denormals()
     lines = []
     with staged(root) as folder:
         for line in _lines(plan, store):

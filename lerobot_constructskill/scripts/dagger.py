@@ -22,9 +22,7 @@ def dagger(config: DaggerConfig) -> str:
     from lerobot_constructskill.artifacts.store import Store
     from lerobot_constructskill.dagger.plan import Plan
     from lerobot_constructskill.dagger.run import run_dagger
-    from lerobot_constructskill.training.trainers import flush_denormals
 
-    flush_denormals()
     root = Path(config.root) if config.root else Path("outputs/dagger") / config.repo_id.split("/")[1]
     lines = run_dagger(
         Plan(config), Store(config.store.absolute()), root.absolute(), lambda line: print(line, flush=True)
