@@ -52,7 +52,7 @@ class PrivilegedState:
 
     @property
     def floor(self) -> float:
-        """Height of what lies in the receptacle."""
+        """Height of the receptacle's floor."""
         return self.bin_position[2] - self.bin_interior[2] / 2
 
 

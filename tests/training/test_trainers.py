@@ -1,4 +1,4 @@
-"""A training that ends from outside is no result of a policy."""
+"""A training that ends from outside is no result of a policy, and all threads that train flush denormal numbers."""
 
 import os
 import subprocess
