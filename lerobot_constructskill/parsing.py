@@ -11,6 +11,7 @@ from typing import Any
 import draccus
 import yaml
 
+from lerobot_constructskill import tags  # noqa: F401
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find

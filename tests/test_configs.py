@@ -8,6 +8,7 @@ from pathlib import Path
 import draccus
 import lerobot.policies  # noqa: F401  registers the policies
 import pytest
+import yaml
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
@@ -18,6 +19,7 @@ from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -28,6 +30,7 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
 SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
 PRECISE = sorted((CONFIGS / "generate" / "precise").glob("*.yaml"))
+POLICIES = sorted((CONFIGS / "policy").glob("*.yaml"))
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
 TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
 
@@ -160,6 +163,41 @@ def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites(
     assert whole == precise.variants["precise"].policy and parts.training == precise.training
     only = suite.variants["wrist_state_hidden"].policy
     assert before == {**only, "head_hidden_layers": 1, "regression_loss": "mse"}
+
+
+@pytest.fixture
+def study_of(tmp_path):
+    """A study of one variant, whose policy is as said."""
+
+    def make(policy: str) -> StudyConfig:
+        file = tmp_path / "mine.yaml"
+        lines = [
+            "name: mine",
+            "settings: {brick: {data: fast_wrist, env: {obs_type: pixels_agent_pos}}}",
+            f"variants: {{ours: {{policy: {policy}}}}}",
+        ]
+        file.write_text("\n".join(lines))
+        return parse(StudyConfig, [], file)
+
+    return make
+
+
+@pytest.mark.parametrize("path", POLICIES, ids=lambda path: path.stem)
+def test_a_policy_is_named_in_a_file_that_lies_anywhere(path, study_of):
+    fields = yaml.safe_load(path.read_text())
+    (run, *_) = list_runs(study_of(f"!policy {path.stem}").study)
+    assert fields == {name: getattr(run.arm.policy, name) for name in fields}
+    with_another = study_of(f"!policy {{preset: {path.stem}, camera: base, crop: [0, 0, 0.5, 0.5]}}").study
+    assert with_another.variants["ours"].policy == fields | {"camera": "base", "crop": [0, 0, 0.5, 0.5]}
+
+
+def test_a_policy_that_is_not_there_is_refused_with_those_that_are(study_of):
+    with pytest.raises(InputError, match="no policy configuration 'exact'; the configurations are: .*precise"):
+        study_of("!policy exact")
+    with pytest.raises(InputError, match="such as `preset: precise`"):
+        study_of("!policy {camera: base}")
+    with pytest.raises(InputError, match="a mapping"):
+        study_of("!policy [precise]")
 
 
 def test_cut_to_fewer_seeds_every_variant_and_reference_has_them():

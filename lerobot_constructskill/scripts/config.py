@@ -29,9 +29,7 @@ def main() -> None:
         "As in: lerobot-train --config_path=$(constructskill-config train/act)",
         epilog=EPILOG,
     )
-    parser.add_argument(
-        "name", nargs="?", help="dagger/NAME, generate/NAME, study/NAME or train/NAME; all are listed without it"
-    )
+    parser.add_argument("name", nargs="?", help=f"{'/NAME, '.join(KINDS)}/NAME; all are listed without it")
     with edge():
         arguments, unknown = parser.parse_known_args()
         if unknown:
