@@ -6,6 +6,7 @@ pytestmark = pytest.mark.slow
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 IMAGES = "[...document.images].filter(image => !(image.complete && image.naturalWidth > 0)).length"
+VISIBLE = "[...document.images].filter(image => image.checkVisibility()).map(image => image.className)"
 CUT = """[...document.querySelectorAll(".scroll")].filter(box =>
     box.getBoundingClientRect().right > innerWidth + 1 || box.getBoundingClientRect().left < 0).length"""
 
@@ -23,6 +24,7 @@ def test_page(study, browser, width, scheme):
     assert page.evaluate(OVERFLOW) == 0
     assert page.evaluate(CUT) == 0
     assert page.evaluate(IMAGES) == 0
+    assert page.evaluate(VISIBLE) == [scheme] * page.locator("figure:has(img)").count()
     assert page.locator("table").count() > 5
     assert said == []
     assert [url for url in asked if not url.startswith("data:")] == [address]
