@@ -27,6 +27,7 @@ MEDIA = {".png", ".jpg", ".mp4", ".parquet"}
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)")
 UNUSED = re.compile(r"\.map$|/lunr/")
 """Of the theme: what debuggers and searches in other languages load."""
+UNSEARCHED = "---\nsearch: {exclude: true}\n---"
 LANGUAGES = {".py": "python", ".yaml": "text", "": "dockerfile"}
 """What is shown of a folder, and how: coloured, the page of all configurations would be three times as large."""
 
@@ -95,9 +96,9 @@ def shown(path: Path) -> str:
 
 
 def source_page(path: Path) -> str:
-    """A file, or every file under a folder, as blocks of code."""
+    """A file, or every file under a folder, as blocks of code, which the search's index leaves out."""
     sources = [path] if path.is_file() else sorted(one for one in path.rglob("*") if is_text(one))
-    return "\n\n".join([f"# {uri(path)}", *map(block, sources)])
+    return "\n\n".join([UNSEARCHED, f"# {uri(path)}", *map(block, sources)])
 
 
 def block(path: Path) -> str:
