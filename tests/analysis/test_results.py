@@ -58,6 +58,7 @@ def test_a_published_study_is_one_of_configs_with_as_many_seeds_or_fewer(folder)
         assert study["variants"][name]["seeds"] <= fields.get("seeds", 10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
 def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     """Its Markdown, that is: the figures are not drawn, which takes most of a report's time."""

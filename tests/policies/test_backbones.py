@@ -88,6 +88,7 @@ ROUNDING = 1e-4
 AVX2 and on one with AVX-512). bfloat16 rounds each number by up to 2e-3 of it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "precision"), [*(by_cost(name, NATIVE[-1]) for name in BACKBONES), ("vit_tiny16", "float32")]
 )

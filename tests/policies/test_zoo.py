@@ -50,6 +50,7 @@ def check_it_encodes(name, folder, images, statistics):
     return spec
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", TIMM)
 def test_a_model_of_timm_encodes_as_its_configuration_says(model, tmp_path, images):
     import timm
@@ -59,6 +60,7 @@ def test_a_model_of_timm_encodes_as_its_configuration_says(model, tmp_path, imag
     assert (spec.repo_id, spec.revision) == (f"timm/{model}", "0123abc")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", TRANSFORMERS)
 def test_a_model_of_transformers_encodes_as_its_folder_says(kind, tmp_path, images):
     describe(tmp_path, TRANSFORMERS[kind])
