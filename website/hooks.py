@@ -49,6 +49,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_) -> str:
     """Lead links to folders and sources to the pages that show them, to a copy to its original, a task to its page."""
+    if page.file.src_uri == "CHANGELOG.md":  # what was before is rarely what is sought
+        page.meta["search"] = {"exclude": True}
     folder = (ROOT / page.file.src_uri).parent
     twins = config.extra["copies"]
 
