@@ -49,8 +49,6 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_) -> str:
     """Lead links to folders and sources to the pages that show them, to a copy to its original, a task to its page."""
-    if page.file.src_uri == "CHANGELOG.md":  # what was before is rarely what is sought
-        page.meta["search"] = {"exclude": True}
     folder = (ROOT / page.file.src_uri).parent
     twins = config.extra["copies"]
 
@@ -62,6 +60,13 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_) -> st
 
     markdown = LINK.sub(lead, markdown)
     return task_pages.with_links(markdown) if page.file.src_uri == "docs/tasks.md" else markdown
+
+
+def on_page_content(html: str, page: Page, **_) -> str:
+    """Leave the changelog out of the search's index: what was before is rarely what is sought."""
+    if page.file.src_uri == "CHANGELOG.md":
+        page.meta["search"] = {"exclude": True}
+    return html
 
 
 def reached(pages: list[Path]) -> list[Path]:
