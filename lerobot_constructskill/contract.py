@@ -124,6 +124,7 @@ class Task:
         action_names: channels of `action`, translations (and rotations) first, the gripper last.
         noisy_yield: share of demonstrations under the default noise that succeed at least; the others are discarded,
             and a data set of a task below 0.5 needs a larger `max_failures`.
+        is_brick: the object is a brick, whose size can be perturbed.
     """
 
     name: str
@@ -134,6 +135,7 @@ class Task:
     expert: str
     action_names: tuple[str, ...] = (*TRANSLATION, GRIPPER)
     noisy_yield: float = 0.9
+    is_brick: bool = False
 
 
 _PICK_PLACE = "lerobot_constructskill.demos.pick_place:PickPlaceExpert"
@@ -154,6 +156,7 @@ TASKS = {
             horizon=700,
             scene=f"{_SCENES}.brick:BrickToBinEnv",
             expert=_PICK_PLACE,
+            is_brick=True,
         ),
         Task(
             name="brick_to_bin_shifted",
@@ -162,6 +165,7 @@ TASKS = {
             horizon=700,
             scene=f"{_SCENES}.brick_shifted:BrickToBinShiftedEnv",
             expert=_PICK_PLACE,
+            is_brick=True,
         ),
         Task(
             name="block_to_bin",
@@ -181,6 +185,7 @@ TASKS = {
                 expert=_PRECISE,
                 # 24 of 40 attempts at 5 mm and 15 of 40 at 3 mm: noise turns the brick between the fingers.
                 noisy_yield={0.005: 0.3, 0.003: 0.1}.get(clearance, 0.9),
+                is_brick=True,
             )
             for name, clearance in LADDER.items()
         ),
@@ -192,6 +197,7 @@ TASKS = {
             scene=f"{_SCENES}.brick_turned:BrickToBinTurnedEnv",
             expert=_TURNING,
             action_names=(*TRANSLATION, "dyaw", GRIPPER),
+            is_brick=True,
         ),
         Task(
             name="brick_on_brick",
@@ -200,6 +206,7 @@ TASKS = {
             horizon=400,
             scene=f"{_SCENES}.brick_on_brick:BrickOnBrickEnv",
             expert=_PRECISE,
+            is_brick=True,
         ),
         Task(
             name="tile_to_grid",

@@ -4,8 +4,10 @@ Level 0 is the task as it is. What is drawn once (camera, light, textures, size,
 and a seed alone; what it draws every episode (initial pose, sensor noise) from the episode's own seed.
 """
 
+import re
 from dataclasses import dataclass
 
+from lerobot_constructskill.contract import Task
 from lerobot_constructskill.errors import InputError
 
 
@@ -54,10 +56,15 @@ class Perturbation:
             if name not in AXES:
                 raise InputError(f"Unknown perturbation '{name}'; the axes are: {', '.join(AXES)}.")
             highest = len(AXES[name].levels)
-            if not level.isdecimal() or int(level) > highest:
-                raise InputError(f"The level of '{name}' must be 0 to {highest}, not '{level}'.")
+            if not re.fullmatch("[0-9]{1,2}", level) or int(level) > highest:
+                raise InputError(f"The level of '{name}' must be 0 to {highest}, not '{level[:20]}'.")
         if len(dict(pairs)) < len(pairs):
             raise InputError(f"Each axis has one level; '{self.levels}' names one twice.")
+
+    def check(self, task: Task) -> None:
+        """Raise InputError where another size of brick is asked of a task without one."""
+        if self.amount("size") and not task.is_brick:
+            raise InputError(f"The axis 'size' is EN 771-1's tolerance of bricks; {task.name} has no brick.")
 
     def _pairs(self) -> list[tuple[str, str]]:
         parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]

@@ -79,8 +79,7 @@ class Setting:
 
     def __post_init__(self):
         check(self)
-        get_task(self.task)
-        Perturbation(self.perturb, self.perturb_seed)
+        Perturbation(self.perturb, self.perturb_seed).check(get_task(self.task))
         if self.first_start + self.episodes > 2**31:
             raise InputError(
                 f"The last start must be at most {2**31 - 1}, not {self.first_start + self.episodes - 1}."

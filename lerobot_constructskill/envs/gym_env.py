@@ -71,6 +71,7 @@ class ConstructSkillEnv(gym.Env):
         check_values(ConstructSkillEnv.__init__, locals())
         self._perturbation = Perturbation(perturb, perturb_seed)
         self._row = get_task(task)
+        self._perturbation.check(self._row)
         self.task = task
         self.task_description = self._row.instruction
         self.obs_type = obs_type

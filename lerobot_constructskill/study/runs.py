@@ -265,7 +265,8 @@ def _training_of(study: Study, setting: str, name: str, variant: Variant) -> Tra
 def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
     env = decode(EnvConfig, {**fields, "type": "constructskill"}).gym_kwargs
-    length = env["episode_length"] or get_task(env["task"]).horizon
+    task = get_task(env["task"])  # one: a setting is no suite
+    length = env["episode_length"] or task.horizon
     light_robot, backend = resolve_rendering(env["light_robot"], env["render_backend"])
     return env | {"episode_length": length, "light_robot": light_robot, "render_backend": backend}
 

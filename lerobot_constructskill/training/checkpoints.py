@@ -13,6 +13,7 @@ from lerobot.utils import OBS_STATE, auto_select_torch_device
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.training.recipe import Training
@@ -46,12 +47,17 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
     """Refuse a policy that reads what it would not be shown where it acts.
 
     Raises:
-        InputError: it reads the state, and observations have pictures alone.
+        InputError: it reads the state, and observations have pictures alone, or a camera that they do not have.
     """
     # LeRobot gives a policy that does not name its inputs all of the data set, the state among them.
     reads_state = OBS_STATE in policy.input_features if policy.input_features else getattr(policy, "use_state", True)
     if reads_state and obs_type == "pixels":
         raise InputError("The policy reads observation.state; where it acts, obs_type has to be 'pixels_agent_pos'.")
+    camera, shown = getattr(policy, "camera", None), OBS_TYPES[obs_type]  # others look at whatever they are shown
+    if camera not in (None, *shown):
+        raise InputError(
+            f"The policy reads camera '{camera}'; where it acts, obs_type '{obs_type}' has {', '.join(shown)}."
+        )
 
 
 def checkpoint_artifact(

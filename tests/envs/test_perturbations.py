@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import UserError
@@ -65,14 +67,19 @@ def test_bricks_stay_within_the_standards_tolerance():
         assert (deviation <= [0.0058, 0.0033, 0.0041]).all() and deviation.max() > 1e-4
 
 
-@pytest.mark.sim
-def test_a_task_without_a_brick_has_no_brick_size():
-    env = ConstructSkillEnv("tile_to_grid", render_backend="none", perturb="size=1")
-    with pytest.raises(ValueError, match="EN 771-1"):
-        env.reset(seed=0)
+@pytest.mark.parametrize("task", [name for name, task in TASKS.items() if not task.is_brick])
+def test_a_task_without_a_brick_has_no_brick_size(task):
+    for what in (ConstructSkillEnv, ConstructSkillEnvConfig, Setting):
+        with pytest.raises(UserError, match=f"EN 771-1.*{task} has no brick"):
+            what(task=task, perturb="size=1")
+        what(task=task, perturb="size=0,light=1")
 
 
-@pytest.mark.parametrize("bad, word", [("colour=1", "camera"), ("camera=4", "0 to 3"), ("camera", "0 to 3")])
+@pytest.mark.parametrize(
+    "bad, word",
+    [("colour=1", "camera"), ("camera=4", "0 to 3"), ("camera", "0 to 3"), (f"camera={'0' * 5000}", "0 to 3")],
+    ids=["axis", "level", "no level", "many digits"],
+)
 def test_levels_that_do_not_exist_are_refused(bad, word):
     with pytest.raises(UserError, match=word):
         ConstructSkillEnvConfig(perturb=bad)

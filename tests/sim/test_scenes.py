@@ -1,5 +1,7 @@
 """What every registered task owes, checked on the real simulator and renderer."""
 
+from importlib import import_module
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from mani_skill.utils.structs import Pose
 
 import lerobot_constructskill.sim.register  # noqa: F401
 from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
+from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
+from lerobot_constructskill.sim.tasks.brick_on_brick import TOLERANCE
 
 pytestmark = pytest.mark.sim
 
@@ -178,6 +182,20 @@ def test_a_rung_of_the_ladder_has_its_clearance_and_the_fingers_open_above_its_r
     tips = env.rest_position[2] + env.object_size[2] / 2 - 0.039
     assert tips > env.bin_position[2] + env.bin_interior[2] / 2
     env.close()
+
+
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_the_row_says_whether_the_scene_has_a_brick(task):
+    module, name = task.scene.split(":")
+    assert getattr(import_module(module), name).is_brick == task.is_brick
+
+
+def test_bricks_of_another_size_have_to_be_as_flush_as_any():
+    for seed in range(3):
+        env = make("brick_on_brick", perturbation=Perturbation("size=2", seed))
+        assert env.object_size != type(env).object_size and env.bin_floor == env.object_size[2]
+        np.testing.assert_allclose(env.play, TOLERANCE)
+        env.close()
 
 
 def test_a_brick_that_leans_on_the_rim_is_placed_as_the_paper_counts_and_not_strictly():

@@ -16,7 +16,7 @@ from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.execute import EPISODES
-from lerobot_constructskill.study.rows import NOT_RUN, EpisodeRow, read_rows, write_rows
+from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
@@ -281,6 +281,27 @@ def test_whoever_has_the_folder_of_a_study_goes_on_with_it_without_its_runs(tmp_
     pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
 
 
+def test_going_on_with_a_published_study_adds_to_its_provenance(tmp_path, monkeypatch):
+    root, stage = tmp_path / "x", "of which evaluation, s"
+    root.mkdir()
+    (root / PROVENANCE).write_text(json.dumps({"wall time, s": 2000, stage: 700, "beside it": "tests"}))
+
+    def make_one(job):
+        with timed(root, "evaluation"):
+            pass
+        (root / TIMINGS).write_text('{"stage": "evaluation", "seconds": 5}\n')
+        yield from job.runs
+
+    monkeypatch.setattr("lerobot_constructskill.study.run.make_runs", make_one)
+    monkeypatch.setattr("lerobot_constructskill.study.run.validate", lambda *_: None)
+    run_study(study(variants={"a": Variant(ACT, seeds=1)}, references={}), "", root, Store(tmp_path / "s"), Options())
+    facts = json.loads((root / PROVENANCE).read_text())
+    assert facts["wall time, s"] >= 2000 and facts[stage] == 705 and facts["beside it"] == "tests"
+    (root / PROVENANCE).write_text('{"wall time, s": "1 h"}')
+    with pytest.raises(InputError, match="'wall time, s' must be a number of seconds, not '1 h'"):
+        run_study(study(), "", root, Store(tmp_path / "s"), Options())
+
+
 def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
     table = make_all(study(), tmp_path)
     row = {"evaluation_seed": 1000, "episode": 0, "error_kind": "weights", "error": "none here"}
@@ -447,6 +468,15 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"settings": {"fixed": Setting("smoke", {"foo": 1})}}, "settings.fixed.env: .*foo"),
         ({"settings": {"fixed": Setting("smoke", {"episode_length": -5})}}, "settings.fixed.env: episode_length"),
         ({"settings": {"fixed": Setting("smoke", {"task": "bins"})}}, "settings.fixed.env: .*bins"),
+        ({"settings": {"fixed": Setting("smoke", ENV | {"task": "bins"})}}, "settings.fixed.env: Unknown task 'bins'"),
+        ({"settings": {"fixed": Setting("smoke", ENV | {"task": "block_to_bin", "perturb": "size=1"})}}, "no brick"),
+        (
+            {
+                "settings": {"fixed": Setting("smoke", {"obs_type": "pixels"})},
+                "variants": {"a": Variant({"type": "frozen_vit", "camera": "wrist"})},
+            },
+            "variants.a.policy: The policy reads camera 'wrist'",
+        ),
     ],
     ids=str,
 )

@@ -28,8 +28,15 @@ class BrickOnBrickEnv(PreciseEnv, BrickToBinEnv):
 
     spawn_range = 0.10
     yaw_tolerance = np.radians(3.0)
-    bin_floor = BrickToBinEnv.object_size[2]
-    bin_interior = (BrickToBinEnv.object_size[0] + 2 * TOLERANCE, BrickToBinEnv.object_size[1] + 2 * TOLERANCE, 0.04)
+
+    # Both bricks are of one size, which a perturbation can draw.
+    @property
+    def bin_floor(self) -> float:
+        return self.object_size[2]
+
+    @property
+    def bin_interior(self) -> tuple[float, float, float]:
+        return (self.object_size[0] + 2 * TOLERANCE, self.object_size[1] + 2 * TOLERANCE, 0.04)
 
     def _load_bin(self) -> Actor:
         builder = self.scene.create_actor_builder()
