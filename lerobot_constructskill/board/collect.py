@@ -32,7 +32,8 @@ def recorded_in(root: Path) -> Piles:
     folders = {int(found[1]): path for path in sorted(root.glob("seed_*")) if (found := re.fullmatch(SEED, path.name))}
     if not folders:
         raise MissingError(f"'{root}' has no folder seed_0, seed_1, ... of recordings.")
-    files = {seed: sorted(folder.rglob("*.parquet")) for seed, folder in folders.items()}
+    # A name with a dot is a file that a process has not finished, or never did.
+    files = {seed: sorted(folder.rglob("[!.]*.parquet")) for seed, folder in folders.items()}
     return {seed: [one for path in paths for one in read_recordings(path)] for seed, paths in files.items()}
 
 

@@ -70,7 +70,8 @@ class Entry:
 
     @property
     def is_ranked(self) -> bool:
-        return not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM and is_replayable(self.said)
+        enough = len(self.said.training_seeds) >= RANKED_FROM
+        return not self.is_reference and enough and self.level != CLAIMED and is_replayable(self.said)
 
     @property
     def missing_seeds(self) -> int:

@@ -103,7 +103,7 @@ def eval_results(entry: Entry, dataset_id: str) -> str:
 def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
     """leaderboard.json of vla-evaluation-harness, whose keepers still have to register the benchmark.
 
-    No overall score is given: the protocol has no number that hides the tasks. Only standard entries are.
+    No overall score is given: the protocol has no number that hides the tasks. Only standard policies are in it.
 
     Args:
         day: when, ISO 8601.
@@ -121,9 +121,14 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
             "notes": f"{len(entry.said.training_seeds)} training seeds; {entry.level} by constructskill-verify.",
         }
         for entry in entries
-        if entry.said.settings_class == STANDARD
+        if _is_official(entry)
     ]
     return {"last_updated": day, "results": results}
+
+
+def _is_official(entry: Entry) -> bool:
+    """Whether it is a policy on the suite's own settings, whose names others know."""
+    return entry.said.settings_class == STANDARD and not entry.is_reference
 
 
 def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
@@ -134,7 +139,7 @@ def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | N
         folder = out / "exports" / entry.name
         for seed in entry.said.training_seeds:
             _write(folder / f"seed_{seed}" / "eval_info.json", json.dumps(eval_info(entry, seed), indent=2))
-        if dataset_id:
+        if dataset_id and _is_official(entry):
             _write(folder / ".eval_results" / "constructskill.yaml", eval_results(entry, dataset_id))
 
 

@@ -71,12 +71,8 @@ def instructions(submission: Submission, value: str) -> str:
     Raises:
         InputError: it is no policy that looks, so that there is no checkpoint to run.
     """
+    _check_looks(submission)
     declaration = submission.declaration
-    if declaration.about.observes not in OBS_TYPES:
-        raise InputError(
-            f"{declaration.about.name} observes {declaration.about.observes}: a re-run evaluates the checkpoint of a "
-            f"policy that observes {' or '.join(OBS_TYPES)}."
-        )
     first = fresh_start(submission.sha256, value)
     settings = fresh_settings(declaration.settings, first)
     lines = [f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:"]
@@ -98,6 +94,15 @@ def instructions(submission: Submission, value: str) -> str:
     return "\n".join(lines)
 
 
+def _check_looks(submission: Submission) -> None:
+    about = submission.declaration.about
+    if about.observes not in OBS_TYPES:
+        raise InputError(
+            f"{about.name} observes {about.observes}: a re-run evaluates the checkpoint of a policy that observes "
+            f"{' or '.join(OBS_TYPES)}."
+        )
+
+
 def _is_drawn(setting: Setting) -> bool:
     """Whether it names a perturbation or a draw, which a re-run's settings have to repeat."""
     return bool(setting.perturb or setting.perturb_seed)
@@ -107,8 +112,10 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
     """Set a re-run beside its submission.
 
     Raises:
-        InputError: it is not from the starts, or not of the training seeds, that it should be.
+        InputError: it is no policy that looks, the re-run is not from the starts or not of the training seeds that it
+            should be, or they are too few for the test to refuse anything.
     """
+    _check_looks(submission)
     first = fresh_start(submission.sha256, value)
     if again.declaration.settings != fresh_settings(submission.declaration.settings, first):
         raise InputError(f"{value!a:.80} calls for the starts from {first} on; the re-run has others.")
@@ -116,6 +123,12 @@ def compare(submission: Submission, again: Submission, value: str) -> Comparison
         raise InputError("The re-run does not have the submission's training seeds.")
     names = sorted(submission.declaration.settings)
     pairs = [(placed(submission, name), placed(again, name)) for name in names]
+    could_be = holm([mean_p_value(np.ones(len(own)), np.zeros(len(fresh))) for own, fresh in pairs])
+    if min(could_be) >= RERUN_ALPHA:
+        raise InputError(
+            "Too few starts to confirm anything: if all placed as submitted and none anew, p would be "
+            f"{min(could_be):.2g}, not below {RERUN_ALPHA}."
+        )
     p_values = holm([mean_p_value(*pair) for pair in pairs])
     rows = zip(names, pairs, p_values, strict=True)
     return Comparison(value, [Rates(name, own.mean(), fresh.mean(), p) for name, (own, fresh), p in rows])

@@ -45,6 +45,11 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
     assert submission.declaration.backend == "physx_cpu, none rendering"
 
 
+def test_what_a_killed_process_left_is_not_read(recorded, tmp_path):
+    (recorded / "seed_0" / ".host-1.block_to_bin-7.parquet").write_bytes(b"PAR1")
+    assert len(made(tmp_path / "made", recorded_in(recorded)).claims) == 4
+
+
 def test_a_missing_episode_is_refused_unless_its_run_failed(recorded, tmp_path):
     for path in (recorded / "seed_3").glob("*-8-*"):
         path.unlink()

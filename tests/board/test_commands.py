@@ -20,7 +20,7 @@ from lerobot_constructskill.board.submission import EPISODES, Claim, read_submis
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
-SETTINGS = {"shifted": {"task": "brick_to_bin_shifted", "episodes": 2, "episode_length": 3, "first_start": 7}}
+SETTINGS = {"shifted": {"task": "brick_to_bin_shifted", "episodes": 5, "episode_length": 3, "first_start": 7}}
 ABOUT = dict.fromkeys(("name", "submitter", "policy", "revision", "data", "training", "compute"), "a test's")
 
 EVALUATE = """
@@ -32,7 +32,7 @@ env = ConstructSkillEnv("brick_to_bin_shifted", episode_length=3, render_backend
 for seed in (0, 1):
     os.environ["CONSTRUCTSKILL_RECORD"] = f"{root}/seed_{seed}"
     rng = np.random.default_rng(seed)
-    for start in (first, first + 1):
+    for start in range(first, first + 5):
         env.reset(seed=start)
         for _ in range(3):
             env.step(rng.uniform(-0.1, 0.1, 4).astype(np.float32))
@@ -41,7 +41,7 @@ env.close()
 
 
 def evaluate(root: Path, first: int) -> None:
-    """Two training seeds' episodes from two starts, in a process that never renders."""
+    """Two training seeds' episodes from five starts, in a process that never renders."""
     subprocess.run([sys.executable, "-c", EVALUATE, str(root), str(first)], check=True)
 
 
@@ -52,7 +52,7 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     flags = ["--suite=bins", f"--about={tmp_path / 'about.yaml'}", f"--settings={tmp_path / 'settings.yaml'}"]
     entry, again = tmp_path / "entry", tmp_path / "again"
     said = call("constructskill-submit", *flags, f"--recorded={tmp_path / 'recorded'}", f"--root={entry}")
-    assert "custom, 4 episodes of 2 training seeds" in said
+    assert "custom, 10 episodes of 2 training seeds" in said
 
     said = call("constructskill-verify", f"--root={entry}", "--value=beef")
     first = int(said.partition("fresh starts are ")[2].split()[0])
@@ -62,7 +62,7 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     call("constructskill-submit", *flags, f"--recorded={tmp_path / 'fresh'}", f"--root={again}")
     rerun = ["--value=beef", f"--rerun={again}", f"--record={tmp_path / 'verified'}"]
     said = call("constructskill-verify", f"--root={entry}", *rerun)
-    assert "4 of 4 episodes replayed (12 steps)" in said and "shifted 0% submitted, 0% run anew" in said
+    assert "10 of 10 episodes replayed (30 steps)" in said and "shifted 0% submitted, 0% run anew" in said
     path = tmp_path / "verified" / "entry.json"
     verdict = json.loads(path.read_text())
     assert verdict["level"] == "re-run" and verdict["machines"] == [processor()]

@@ -64,8 +64,24 @@ def test_seeds_are_the_same_in_any_order_and_a_draw_is_told(submission):
 def test_a_reference_has_no_checkpoint_to_run_anew(submission, sees):
     about = replace(submission.declaration.about, observes=sees)
     reference = replace(submission, declaration=replace(submission.declaration, about=about))
-    with pytest.raises(InputError, match=f"observes {sees}: a re-run evaluates the checkpoint of a policy that"):
+    said = f"observes {sees}: a re-run evaluates the checkpoint of a policy that"
+    with pytest.raises(InputError, match=said):
         instructions(reference, VALUE)
+    with pytest.raises(InputError, match=said):
+        compare(reference, rerun(reference, 1.0), VALUE)
+
+
+@pytest.mark.parametrize("starts, enough", [(2, False), (5, False), (6, True)])
+def test_starts_that_could_refuse_nothing_confirm_nothing(submission, starts, enough):
+    """Two settings: from five starts each, all against none has p = 2 * 0.0079."""
+    settings = {name: replace(one, episodes=starts) for name, one in submission.declaration.settings.items()}
+    said = replace(submission.declaration, settings=settings)
+    few = replace(submission, declaration=said, claims=claims(settings, 1.0))
+    if enough:
+        assert all(one.is_worse for one in compare(few, rerun(few, 0.0), VALUE).rates)
+    else:
+        with pytest.raises(InputError, match="Too few starts to confirm anything"):
+            compare(few, rerun(few, 1.0), VALUE)
 
 
 def test_one_start_is_compared_by_training_seeds(submission):
