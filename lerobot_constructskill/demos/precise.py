@@ -1,7 +1,7 @@
 """The expert of tasks with little play: it watches the object, not only the hand, and lowers it into place.
 
-The six phases are the pick-and-place expert's. CARRY ends over the receptacle; RELEASE, in which no noise is added,
-aligns the object, lowers it and opens the jaws.
+The six phases are the pick-and-place expert's. CARRY ends over the receptacle; RELEASE aligns the object,
+lowers it and opens the jaws; noise has no part in it unless `noise.release_sigma` says so.
 """
 
 from dataclasses import dataclass

@@ -5,7 +5,8 @@ observation. Action queues and temporal ensembling, which mix chunks of several 
 sample (diffusion, flow) draw anew for every frame, which their consistency includes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,6 +123,23 @@ def check_actions(policy: PreTrainedPolicy, dataset: LeRobotDataset) -> None:
         raise InputError(
             f"The policy's actions have {feature.shape[0]} numbers, those of '{dataset.repo_id}' have {len(names)}."
         )
+
+
+@contextmanager
+def shown(dataset: LeRobotDataset) -> Iterator[None]:
+    """Refuse a policy that asks for an observation, by the name that its own processors give, which is not there.
+
+    Raises:
+        InputError: inside the block it looks for one that the data set does not have.
+    """
+    try:
+        yield
+    except KeyError as error:
+        key = str(error.args[0])
+        if not key.startswith("observation.") or key in dataset.meta.features:
+            raise
+        has = ", ".join(name for name in dataset.meta.features if name.startswith("observation."))
+        raise InputError(f"The policy reads {key}; '{dataset.repo_id}' has {has}.") from None
 
 
 def predict(

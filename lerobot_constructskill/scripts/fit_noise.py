@@ -33,7 +33,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     Raises:
         FileNotFoundError: the data set or the policy is not there.
-        ValueError: no such episodes, or nothing to fit on.
+        ValueError: no such episodes, nothing to fit on, or a policy with other actions or observations.
     """
     import numpy as np
     import yaml
@@ -47,6 +47,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot_constructskill.parsing import decode
     from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.rollout.agents import PolicyAgent
+    from lerobot_constructskill.rollout.offline import check_actions, shown
 
     dataset = open_lerobot(config.repo_id, config.root)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
@@ -54,9 +55,11 @@ def fit_noise(config: FitNoiseConfig) -> str:
     with one_sentence(config.policy_path):
         device = config.device or str(auto_select_torch_device())
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)
+    check_actions(agent.policy, dataset)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
     bar = Progress(episodes, "demonstrations", unit="demo")
-    errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]
+    with shown(dataset):
+        errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,

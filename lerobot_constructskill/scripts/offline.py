@@ -91,18 +91,19 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.rollout.agents import PolicyAgent
-    from lerobot_constructskill.rollout.offline import check_actions, observed, offline_metrics, predict
+    from lerobot_constructskill.rollout.offline import check_actions, observed, offline_metrics, predict, shown
 
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
-    metrics = offline_metrics(predict(*pipeline, view, episodes, config.batch_size))
+    with shown(dataset):
+        predictions = predict(*pipeline, view, episodes, config.batch_size)
     return {
         "policy": agent.policy.name,
         "training_seed": _training_seed(checkpoint),
-        **asdict(metrics),
+        **asdict(offline_metrics(predictions)),
         **{name: getattr(agent.policy.config, name, None) for name in PRECISION},
         "checkpoint": str(checkpoint),
         "weights_sha256": file_sha256(checkpoint / "model.safetensors"),

@@ -54,6 +54,13 @@ def test_the_card_counts_what_there_is(card, data):
     np.testing.assert_allclose([float(found[1]), float(found[2])], [low, high], atol=1e-3)
 
 
+def test_the_card_of_another_task_evaluates_that_task_and_tells_its_noise(data):
+    facts = card_facts(data)
+    noise = facts["generator"]["noise"] | {"release_sigma": 0.003}
+    card = render(facts | {"generator": facts["generator"] | {"task": "brick_on_brick", "noise": noise}})
+    assert card.count("--env.task=brick_on_brick") == 2 and "and 3.0 mm\nin RELEASE while" in card
+
+
 def test_every_column_of_the_data_set_is_on_the_card(card, data):
     named = set(re.findall(r"^\| `([\w.]+)` \|", card, re.MULTILINE))
     bookkeeping = {"timestamp", "frame_index", "episode_index", "index", "task_index"}

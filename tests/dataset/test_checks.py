@@ -163,6 +163,14 @@ CORRUPTIONS = {
         "Seeds 1000000 made several",
     ),
     "a seed of the evaluation": (column("sim.seed", lambda seed: seed - 1_000_000 + 1000), "Hold-out", "below"),
+    "the starts of the leaderboard": (
+        lambda root: [
+            column("sim.seed", lambda seed: seed - 1_000_000 + 5000)(root),
+            metadata(SIDECAR, lambda facts: facts["generator"].update(seed_start=5000))(root),
+        ],
+        "Hold-out",
+        "below 1000000: evaluations",
+    ),
     "stale statistics": (
         metadata("meta/stats.json", lambda stats: stats["action"].update(std=[1, 1, 1, 1])),
         "Statistics",

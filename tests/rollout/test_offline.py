@@ -13,7 +13,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict
+from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict, shown
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
 EPISODES, CHUNK = [3, 7], 5
@@ -156,6 +156,14 @@ def test_a_policy_is_not_compared_with_other_actions(config, feature_set, names,
     other = SimpleNamespace(repo_id="a/b", meta=SimpleNamespace(features={"action": {"names": names}}))
     with pytest.raises(ValueError, match=said):
         check_actions(policy, other)
+
+
+def test_an_observation_that_is_not_there_is_a_sentence(feature_set):
+    said = "reads observation.images.wrist; 'local/random' has observation.features"
+    with pytest.raises(ValueError, match=said), shown(feature_set):
+        raise KeyError("observation.images.wrist")
+    with pytest.raises(KeyError), shown(feature_set):
+        raise KeyError("a fault of ours")
 
 
 @pytest.mark.parametrize(
