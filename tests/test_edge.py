@@ -12,9 +12,11 @@ import pytest
 
 from lerobot_constructskill import parsing
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts import console
+from lerobot_constructskill.scripts.film import FilmConfig
 
 SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
 BARE = {"constructskill", "constructskill-doctor", "constructskill-config"}
@@ -122,3 +124,9 @@ def test_no_name_leads_out_of_the_data_folder(command: str, name: str) -> None:
         if field in {one.name for one in fields(config_class)}:
             made = outcome(config_class, [*flags(command, config_class), f"--{field}={name!r}"])
             assert isinstance(made, Exception) and f"{field} must be user/name" in str(made)
+
+
+@pytest.mark.parametrize("out", ["film", "film.gif", "."])
+def test_a_film_has_the_ending_that_it_can_be_written_by(out):
+    with pytest.raises(InputError, match=r"ends in \.mp4"):
+        FilmConfig(out=Path(out))

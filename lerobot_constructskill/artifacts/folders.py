@@ -28,6 +28,7 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
     Raises:
         FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
     """
+    root = root.absolute()  # of '.', the name beside which the parts lie is not known
     if root.exists():
         sweep(root)
         raise TakenError(f"The output folder {root} exists already; remove it or name another.")

@@ -58,7 +58,8 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
         if self._env is None:
             self._env = self._make_scene()
-        obs, info = self._env.reset(seed=[int(s) for s in seeds])
+        # As in `ConstructSkillEnv`: PhysX would keep contacts.
+        obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
         self._steps = 0
         self._done[:] = False
         return self._observations(obs), self._infos(info)

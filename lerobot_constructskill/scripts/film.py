@@ -7,6 +7,7 @@ from typing import Annotated
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
 View = Annotated[str, Among(("close", "policy"))]
@@ -26,6 +27,8 @@ class FilmConfig:
     def __post_init__(self):
         check(self)
         get_task(self.task)
+        if self.out is not None and self.out.suffix != ".mp4":
+            raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
 
 def film(config: FilmConfig) -> str:

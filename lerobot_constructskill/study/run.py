@@ -55,11 +55,11 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
                 with store.claim([run.artifact]):  # one by one: each holds a file open
                     pass  # which tidies up after a process that was killed when it was whole
         table.write()
-        earlier, start = _provenance(root), time.monotonic()
+        earlier, before, start = _provenance(root), seconds_by_stage(root), time.monotonic()
         with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:
             for run in _execute(_jobs(missing, root, store, options), options):
                 table.write()
-                _write_provenance(root, earlier, time.monotonic() - start)
+                _write_provenance(root, earlier, before, time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
         validate(chosen, [run for run in runs if run not in chosen], store, options.workers)
@@ -113,18 +113,31 @@ def _make_all(job: Job) -> list[Run]:
 
 
 def _provenance(root: Path) -> dict[str, Any]:
-    """What earlier sessions of the study said, each up to the last run that it finished."""
+    """What earlier sessions of the study said, each up to the last run that it finished.
+
+    Raises:
+        InputError: it says of seconds what is no number.
+    """
     path = root / PROVENANCE
-    return json.loads(path.read_text()) if path.exists() else {}
+    facts = json.loads(path.read_text()) if path.exists() else {}
+    if bad := [name for name, value in facts.items() if name.endswith(", s") and not isinstance(value, int | float)]:
+        raise InputError(f"'{path}': '{bad[0]}' must be a number of seconds, not {facts[bad[0]]!r}.")
+    return facts
 
 
-def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> None:
-    """Say where the study ran, on every machine, and for how long in all."""
-    stages = {f"of which {stage}, s": round(total) for stage, total in seconds_by_stage(root).items()}
+def _write_provenance(root: Path, earlier: dict[str, Any], before: dict[str, float], seconds: float) -> None:
+    """Say where the study ran, on every machine, and for how long in all; what else it says stays.
+
+    Args:
+        earlier: what it said when this session began. A published folder has no timings, so its seconds stand there.
+        before: the timings of then.
+    """
+    this = {"wall time, s": seconds}
+    for stage, total in seconds_by_stage(root).items():
+        this[f"of which {stage}, s"] = total - before.get(stage, 0)
     machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
-    facts = {
-        "wall time, s": round(earlier.get("wall time, s", 0) + seconds),
-        **stages,
+    facts = earlier | {
+        **{name: round(earlier.get(name, 0) + seconds) for name, seconds in this.items()},
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
     }
     with replaced(root / PROVENANCE) as partial:

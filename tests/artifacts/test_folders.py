@@ -1,5 +1,7 @@
 """Folders that appear whole or not at all."""
 
+from pathlib import Path
+
 import pytest
 
 from lerobot_constructskill.artifacts.folders import MARK, staged
@@ -40,6 +42,12 @@ def test_other_peoples_folders_are_refused_and_left_alone(tmp_path):
         with pytest.raises(FileExistsError), staged(tmp_path / name):
             pass
     assert all((tmp_path / name / "mine").exists() for name in ("set", "other.partial"))
+
+
+def test_the_folder_that_one_is_in_exists(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileExistsError, match=f"{tmp_path} exists already"), staged(Path(".")):
+        pass
 
 
 def test_two_processes_do_not_share_a_folder(tmp_path):
