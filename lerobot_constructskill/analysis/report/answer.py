@@ -62,14 +62,25 @@ def _paragraph(setting: SettingFindings, n_episodes: int, alpha: float) -> str:
 
 
 def _best(lines: list[Line], n_episodes: int) -> str:
+    """Who placed most among those with most seeds, who did better with fewer, and how often it was lifted at best."""
     most_seeds = max(line.seeds for line in lines)
     rivals = [line for line in lines if line.seeds == most_seeds]
-    top = max(line.outcomes["placed"].mean.value for line in rivals)
-    if top == 0:
-        return f"No variant placed the object in any of its seeds; {_lifts(rivals)}."
-    best = [line for line in rivals if line.outcomes["placed"].mean.value == top]
+    top, best = _top(rivals)
     rank = f", the most of {len(rivals)} variants with {seeds(most_seeds)}" if len(rivals) > len(best) else ""
-    return f"{_placed_in(best)}, in {episodes(top, n_episodes)} on average{rank}; {_lifts(rivals)}."
+    first = f"{_placed_in(best)}, in {episodes(top, n_episodes)} on average{rank}"
+    if top == 0:
+        first = f"no variant{f' with {seeds(most_seeds)}' * (len(rivals) < len(lines))} placed the object"
+    parts = [first]
+    if fewer := [line for line in lines if line.seeds < most_seeds and line.outcomes["placed"].mean.value > top]:
+        share, better = _top(fewer)
+        parts.append(f"with fewer seeds, {_placed_in(better)}, in {episodes(share, n_episodes)} on average")
+    return f"{'; '.join([*parts, _lifts(lines)])}."
+
+
+def _top(lines: list[Line]) -> tuple[float, list[Line]]:
+    """The largest mean share of episodes placed, and whose it is."""
+    top = max(line.outcomes["placed"].mean.value for line in lines)
+    return top, [line for line in lines if line.outcomes["placed"].mean.value == top]
 
 
 def _placed_in(lines: list[Line]) -> str:
@@ -86,9 +97,20 @@ def _placed_in(lines: list[Line]) -> str:
 
 
 def _lifts(lines: list[Line]) -> str:
-    best = max(lines, key=lambda line: line.outcomes["lifted"].mean.value)
-    counts = best.outcomes["lifted"].counts
-    return f"at best it was lifted in {counts.met} of {seeds(counts.seeds)}, by {quoted(best.label)}"
+    """The largest share of seeds that lifted at least once, and whose it is."""
+    top = max(line.outcomes["lifted"].counts.rate for line in lines)
+    if top == 0:
+        return "none lifted it"
+    alike: dict[Counts, list[str]] = {}
+    for line in lines:
+        counts = line.outcomes["lifted"].counts
+        if counts.rate == top:
+            alike.setdefault(counts, []).append(quoted(line.label))
+    named = {
+        counts: listed(labels) if len(labels) < 4 else f"{len(labels)} variants" for counts, labels in alike.items()
+    }
+    shares = [f"in {counts.met} of {seeds(counts.seeds)} by {labels}" for counts, labels in named.items()]
+    return f"at best it was lifted at least once {listed(shares)}"
 
 
 def _verdicts(setting: SettingFindings, criterion: str, noun: str) -> str:
@@ -106,8 +128,15 @@ def _verdicts(setting: SettingFindings, criterion: str, noun: str) -> str:
         verb = "is" if undecided == 1 else "are"
         number = "" if share == "the " else f"{len(comparisons)} "
         noun_form = "comparison" if len(comparisons) == 1 else "comparisons"
-        parts.append(f"{share}{number}declared {noun_form} {verb} {Verdict.INCONCLUSIVE}")
+        parts.append(
+            f"{share}{number}declared {noun_form}{_of_those_made(setting, comparisons)} {verb} {Verdict.INCONCLUSIVE}"
+        )
     return f"{noun}: {'; '.join(parts)}."
+
+
+def _of_those_made(setting: SettingFindings, comparisons: list[Comparison]) -> str:
+    missing = setting.declared - len(comparisons)
+    return f" that can be made ({missing} more cannot)" if missing else ""
 
 
 def _ordered(pair: Comparison) -> tuple[str, str]:
@@ -137,9 +166,9 @@ def _offline_error(setting: SettingFindings, alpha: float) -> str:
     if correlation is None:
         return ""
     if correlation.p_value >= alpha:
-        return f"Held-out error does not show which seeds of a variant place ({tau(correlation)})."
+        return f"Held-out error does not show which seeds of a variant place ({tau(correlation)}, not corrected)."
     direction = "lower" if correlation.tau.value < 0 else "higher"
-    return f"A variant's seeds with {direction} held-out error place more often ({tau(correlation)})."
+    return f"A variant's seeds with {direction} held-out error place more often ({tau(correlation)}, not corrected)."
 
 
 def _sightless(setting: SettingFindings, n_episodes: int) -> str:

@@ -20,7 +20,7 @@ from lerobot_constructskill.analysis.stats.comparisons import compare, holm
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, count, seed_outcomes
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate, spread, spread_p_value
+from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate, spread_p_value
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT
 
@@ -156,7 +156,7 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
 
 def _outcome(runs: pd.DataFrame, criterion: str, rng: np.random.Generator) -> Outcome:
     counts, rates = count(runs, criterion), runs[f"{criterion}_rate"].to_numpy()
-    return Outcome(counts, clopper_pearson(counts), mean_rate(rates, rng), spread(rates, rng))
+    return Outcome(counts, clopper_pearson(counts), mean_rate(rates, rng), float(rates.std()))
 
 
 def _data_sets(runs: pd.DataFrame) -> list[str]:
@@ -200,6 +200,11 @@ def _correlations(lines: list[Line], ordered: list[Line], criterion: str) -> lis
         columns = (runs[column].to_numpy() for column in ("heldout_mse_m2", criterion, "variant"))
         return kendall(*columns, np.random.default_rng(0))
 
-    within = correlate(pd.concat([line.runs for line in lines]))
+    # Two variants of the same checkpoints, evaluated otherwise, would count a seed's error twice.
+    different = {
+        tuple(line.runs[["training_seed", "heldout_mse_m2"]].itertuples(index=False, name=None)): line
+        for line in reversed(lines)
+    }
+    within = correlate(pd.concat([line.runs for line in lines if line in different.values()]))
     of = {line.name: correlate(line.runs) for line in lines}
     return [("Within variants", within), *((line.label, of[line.name]) for line in ordered)]

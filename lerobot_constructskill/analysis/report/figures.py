@@ -31,8 +31,8 @@ def outcome_figure(setting: SettingFindings) -> Drawing:
             for y, line in enumerate(lines):
                 _interval(axis, y, line, criterion, ink)
             for y, line in enumerate(references, start=len(lines)):
-                mean = line.outcomes[criterion].mean.value
-                axis.plot(mean, y, "D", color=ink.paper, markeredgecolor=ink.muted, markersize=6, clip_on=False)
+                share = line.outcomes[criterion].counts.rate
+                axis.plot(share, y, "D", color=ink.paper, markeredgecolor=ink.muted, markersize=6, clip_on=False)
             if references:
                 axis.axhline(len(lines) - 0.5, color=ink.rule, linewidth=0.8)
             axis.set(title=criterion.capitalize(), xlim=(0, 1), xlabel="share of seeds", xticks=np.linspace(0, 1, 5))
@@ -47,7 +47,7 @@ def outcome_figure(setting: SettingFindings) -> Drawing:
 
     caption = "Seeds that met each criterion at least once, with 95 % Clopper–Pearson intervals."
     if references:
-        caption += " Diamonds: floors and ceilings, their share of episodes."
+        caption += " Diamonds: floors and ceilings."
     return Drawing(f"{setting.name}_outcomes", caption, draw)
 
 
@@ -135,15 +135,18 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
             if pairs[criterion]:
                 axis.legend(fontsize=7.5, loc="upper right")
             else:
-                axis.text(0.5, 0.5, "no pair is at risk", transform=axis.transAxes, ha="center", color=ink.muted)
+                axis.text(
+                    0.5, 0.5, "no observed difference at risk", transform=axis.transAxes, ha="center", color=ink.muted
+                )
         axes[0].set_ylabel("chance of the wrong order")
         axes[0].set_ylim(0, 0.5)
         axes[0].set_yticks(np.linspace(0, 0.5, 6), [f"{value:.0%}" for value in np.linspace(0, 0.5, 6)])
         return figure
 
     caption = (
-        "Chance that a study of so many seeds ranks the worse of two variants first, if the shares observed here were "
-        "their true ones. Of the declared pairs, at most the four that are ranked wrongly most often."
+        "By seeds that met the criterion at least once: chance that a study of so many seeds ranks the worse of two "
+        "variants first, if the shares observed here were their true ones. Of the declared pairs whose shares differ, "
+        "at most the four that are ranked wrongly most often."
     )
     return Drawing(f"{setting.name}_ranking", caption, draw)
 

@@ -22,13 +22,13 @@ class Outcome(NamedTuple):
         counts: seeds that met it.
         exact: their share with Clopper-Pearson's interval.
         mean: share of episodes, averaged over seeds.
-        spread: its standard deviation over seeds.
+        spread: its standard deviation over seeds (divisor n), in [0, 0.5].
     """
 
     counts: Counts
     exact: Estimate
     mean: Estimate
-    spread: Estimate
+    spread: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from lerobot_constructskill.analysis.report.findings import Findings, SettingFin
 from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
 from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
 from lerobot_constructskill.analysis.section import Analysis
-from lerobot_constructskill.analysis.stats.power import seeds_needed, wrong_order
+from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wrong_order
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, check_folder, read_rows
 
@@ -133,7 +133,7 @@ def _environment(**options) -> Environment:
     )
     environment.filters |= {word.__name__: word for word in WORDS}
     environment.filters |= {"next": next, "link": Markup}  # a link's path is quoted for URLs already
-    environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed}
+    environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed, "most": MOST}
     return environment
 
 

@@ -56,7 +56,7 @@ def fisher(a: Counts, b: Counts) -> float:
 
 
 def boschloo(a: Counts, b: Counts) -> float:
-    """Boschloo's exact test, two-tailed: never less powerful than Fisher's, as valid (Boschloo 1970)."""
+    """Boschloo's exact test, two-tailed (Boschloo 1970): for equal arms never less powerful than Fisher's; valid."""
     p_value = float(boschloo_exact(_table(a, b)).pvalue)
     return 1.0 if np.isnan(p_value) else min(p_value, 1.0)  # scipy has no p-value where all or no seeds met it
 

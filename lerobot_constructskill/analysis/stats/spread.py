@@ -20,22 +20,20 @@ PERMUTATIONS = 9999
 def mean_rate(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate:
     """Mean over seeds of the share of episodes that succeeded, with an interval over seeds.
 
+    The interval is that of the Bayesian bootstrap (Rubin 1981) with one seed added at 0 and one at 1, widened to hold
+    the mean. For all-or-nothing seeds that is Beta(met + 1, seeds - met + 1), the posterior of `probability_better`.
+    Not `scipy.stats.bootstrap`, whose interval of ten equal seeds has no width; nor is there one of the deviation,
+    whose bounds would be those of the two added seeds.
+
     Args:
         rates: share in [0, 1] of each seed, (seeds,).
         rng: source of the posterior draws.
         level: of the credible interval.
     """
-    rates = np.asarray(rates, dtype=float)
-    return _estimate(float(rates.mean()), _posterior(rates, rng)[0], level)
-
-
-def spread(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate:
-    """Standard deviation over seeds of the share of episodes that succeeded, in [0, 0.5], with its interval.
-
-    Arguments as of `mean_rate`. The value is the deviation of the seeds themselves (divisor n), as the draws' is.
-    """
-    rates = np.asarray(rates, dtype=float)
-    return _estimate(float(rates.std()), _posterior(rates, rng)[1], level)
+    mean, values = float(np.mean(rates)), np.array([*rates, 0.0, 1.0])
+    draws = rng.dirichlet(np.ones(len(values)), size=DRAWS) @ values
+    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
+    return Estimate(mean, min(float(low), mean), max(float(high), mean))
 
 
 def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
@@ -72,19 +70,3 @@ def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray) -> float:
         arms, difference, vectorized=True, alternative="greater", n_resamples=PERMUTATIONS, rng=rng
     )
     return float(result.pvalue)
-
-
-def _posterior(rates: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draws of mean and standard deviation, (DRAWS,) each: the Bayesian bootstrap (Rubin 1981) with one seed added at
-    0 and one at 1. For all-or-nothing seeds that is Beta(met + 1, seeds - met + 1), the posterior of
-    `probability_better`. Not `scipy.stats.bootstrap`, whose interval of ten equal seeds has no width."""
-    values = np.array([*rates, 0.0, 1.0])
-    weights = rng.dirichlet(np.ones(len(values)), size=DRAWS)
-    mean = weights @ values
-    return mean, np.sqrt(np.clip(weights @ values**2 - mean**2, 0, None))
-
-
-def _estimate(value: float, draws: np.ndarray, level: float) -> Estimate:
-    """`value` with the central interval of `draws`, widened to hold it: an extreme value lies outside of its own."""
-    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-    return Estimate(value, min(float(low), value), max(float(high), value))
