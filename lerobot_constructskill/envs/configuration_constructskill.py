@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
-from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, ObsType, RenderBackend
+from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.lerobot_internals import _LazyAsyncVectorEnv, freeze_after_episode_end
@@ -46,7 +46,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     obs_type: ObsType = "pixels"
     episode_length: Steps | None = None
     light_robot: bool | None = None
-    render_backend: RenderBackend = "auto"
+    render_backend: Annotated[str, Among(SEEING)] = "auto"
     vectorization: Annotated[str, Among(VECTORIZATIONS)] = "process"
     perturb: str = ""
     perturb_seed: Seed = 0

@@ -24,7 +24,8 @@ from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.perturbations import Perturbation
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
-RenderBackend = Annotated[str, Among(("auto", "gpu", "cpu", "none"))]
+SEEING = ("auto", "gpu", "cpu")
+RenderBackend = Annotated[str, Among((*SEEING, "none"))]
 
 
 class ConstructSkillEnv(gym.Env):

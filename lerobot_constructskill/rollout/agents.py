@@ -75,6 +75,8 @@ class PolicyAgent:
         with as_input():
             flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
             config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
+        if config.use_peft:
+            raise InputError(f"'{checkpoint}' is a PEFT adapter; merge it into its policy first.")
         config.device = device or config.device
         config.pretrained_path = checkpoint
         on_device = {"device_processor": {"device": config.device}}
@@ -117,7 +119,8 @@ class PolicyAgent:
         (drawn,) = np.random.SeedSequence([self._seed, self._step]).generate_state(1)
         self._step += 1
         device = torch.device(self.policy.config.device)
-        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        amp = torch.autocast(device.type, enabled=self.policy.config.use_amp)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), amp:
             torch.manual_seed(int(drawn))
             action = self.policy.select_action(batch)
         return self.postprocessor(action).squeeze(0).cpu().numpy()

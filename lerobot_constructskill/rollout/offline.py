@@ -185,6 +185,13 @@ def _chunks(policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callabl
     except NotImplementedError:
         policy.reset()  # its queue would answer for the batch before
         chunk = policy.select_action(seen)[:, None]
+    except RuntimeError as error:
+        if "non-empty TensorList" not in str(error):
+            raise
+        raise InputError(
+            f"{policy.name} makes its chunks from a queue of past observations, which single frames do not fill: it "
+            "can only be rolled out."
+        ) from None
     return batch["action"], postprocess(chunk)
 
 

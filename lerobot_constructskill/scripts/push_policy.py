@@ -38,7 +38,7 @@ def push_policy(config: PushPolicyConfig) -> str:
     train, policy = (_read(config.policy_path / name) for name in (TRAIN_CONFIG, "config.json"))
     section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
     with one_sentence(config.repo_id):
-        _push(config, section)
+        _push(config, section, policy["device"])
     return f"Pushed: {config.repo_id}"
 
 
@@ -50,20 +50,21 @@ def _read(path: Path) -> dict:
     return read_facts(path.parent, path.name)
 
 
-def _push(config: PushPolicyConfig, section: str) -> None:
-    from huggingface_hub import ModelCard
+def _push(config: PushPolicyConfig, section: str, device: str | None) -> None:
+    """Load it on any machine, and push it as it is: with the device that it was trained on."""
+    from huggingface_hub import HfApi, ModelCard
     from lerobot.configs import PreTrainedConfig
-    from lerobot.policies import get_policy_class, make_pre_post_processors
+    from lerobot.policies import get_policy_class
 
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig
+    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig, register_third_party_plugins
 
+    register_third_party_plugins()
     policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
     policy_config.repo_id, policy_config.private, policy_config.device = config.repo_id, config.private, "cpu"
     policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
+    policy.config.device = device
     policy.push_model_to_hub(TrainPipelineConfig.from_pretrained(config.policy_path))
-    for processor in make_pre_post_processors(policy_config, str(config.policy_path)):
-        processor.push_to_hub(config.repo_id)
+    HfApi().upload_folder(repo_id=config.repo_id, folder_path=config.policy_path, allow_patterns="policy_*processor*")
     card = ModelCard.load(config.repo_id)
     card.text += section
     card.push_to_hub(config.repo_id)

@@ -63,10 +63,13 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
             "--repo_id=alice/act",
             "--task=brick_to_bin",
         ]
+        saved = json.loads((checkpoint / "config.json").read_text())
+        (checkpoint / "config.json").write_text(json.dumps(saved | {"device": "cuda"}))  # trained on another machine
         call(sys.executable, "-c", PUSH_POLICY, *flags)
         call(BIN / "lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
         files = hub.repos["models/alice/act"].commits[hub.repos["models/alice/act"].branches["main"]]
         card = hub.blobs[files["README.md"][0]].decode()
+        assert json.loads(hub.blobs[files["config.json"][0]])["device"] == "cuda", "and pushed from here"
     assert "library_name: lerobot" in card and "| 7 (this one) | 0/1 | 0/1 |" in card
     assert "Trained on `alice/set`, revision `v3.0`." in card
     assert {"model.safetensors", "config.json", "train_config.json", "policy_preprocessor.json"} <= set(files)

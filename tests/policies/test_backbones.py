@@ -3,6 +3,7 @@
 import copy
 import importlib.util
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -116,7 +117,10 @@ def test_weights_loaded_after_the_first_image_are_the_ones_used(weights, images)
         encoder.model.load_state_dict(load_weights(spec, str(weights("vit_tiny16", seed)))[0])
         features.append(encoder(images))
     assert torch.equal(features[0], features[2]) and not torch.equal(features[0], features[1])
-    assert torch.equal(copy.deepcopy(encoder)(images), features[0])
+    for other in (copy.deepcopy(encoder), pickle.loads(pickle.dumps(encoder))):
+        assert torch.equal(other(images), features[0])
+        other.model.load_state_dict(load_weights(spec, str(weights("vit_tiny16", 1)))[0])
+        assert torch.equal(other(images), features[1]) and torch.equal(encoder(images), features[0])
 
 
 def test_classifiers_and_text_towers_are_dropped(weights, tmp_path):

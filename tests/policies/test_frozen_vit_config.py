@@ -42,6 +42,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"action_scale": math.inf}, "not inf"),
         ({"chunk_size": 1000}, "temporal_ensemble_coeff must be within 0.08 of 0 with chunk_size=1000"),
         ({"action_names": ["dx", "dy", "dz"]}, "gripper"),
+        ({"normalization_mapping": dict.fromkeys(("VISUAL", "STATE", "ACTION"), "MEAN_STD")}, "IDENTITY for VISUAL"),
         ({"action_names": ["gripper"]}, "one or more of"),
         ({"action_names": ["dx", "dx", "gripper"]}, "each once"),
         ({"action_names": ["joint_0", "gripper"]}, "joint_0"),

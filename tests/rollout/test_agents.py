@@ -3,8 +3,11 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
+from lerobot.policies.factory import make_policy_config
 
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.rollout.agents import Lockstep, Observation, PolicyAgent
 
 SEEN = Observation({"pixels": {"base": np.zeros((1, 8, 8, 3), np.uint8)}}, {}, "put it there")
@@ -13,12 +16,15 @@ SEEN = Observation({"pixels": {"base": np.zeros((1, 8, 8, 3), np.uint8)}}, {}, "
 class Sampling(torch.nn.Module):
     """A policy that draws its actions, as Diffusion Policy does."""
 
-    config = SimpleNamespace(device="cpu")
+    def __init__(self, use_amp=False):
+        super().__init__()
+        self.config = SimpleNamespace(device="cpu", use_amp=use_amp)
 
     def reset(self):
         pass
 
     def select_action(self, batch):
+        self.in_amp = torch.is_autocast_enabled("cpu")
         return torch.randn(1, 4)
 
 
@@ -43,3 +49,17 @@ def test_a_policy_that_samples_draws_from_its_episode_and_step_alone():
     drawn = torch.randn(1)
     torch.manual_seed(0)
     assert torch.randn(1) == drawn, "and leaves everybody else's draws alone"
+
+
+@pytest.mark.parametrize("use_amp", [False, True])
+def test_a_policy_acts_in_the_precision_that_lerobots_evaluation_would_use(use_amp):
+    policy = Sampling(use_amp)
+    PolicyAgent(policy, lambda batch: batch, lambda action: action).act(SEEN)
+    assert policy.in_amp == use_amp
+
+
+def test_an_adapter_is_no_policy(tmp_path):
+    config = make_policy_config("act", device="cpu", use_peft=True, pretrained_backbone_weights=None)
+    config.save_pretrained(tmp_path)
+    with pytest.raises(InputError, match="is a PEFT adapter"):
+        PolicyAgent.from_pretrained(tmp_path)

@@ -159,6 +159,12 @@ class FrozenViTChunkConfig(PreTrainedConfig):
                 "set are those of its pooled feature."
             )
         _check_action_names(self.action_names)
+        untouched = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
+        if not untouched.items() <= self.normalization_mapping.items():
+            raise InputError(
+                "normalization_mapping must have IDENTITY for VISUAL and ACTION: the backbone has pixel statistics of "
+                "its own, and actions are in metres."
+            )
         if self.n_action_steps > self.chunk_size:
             raise InputError(
                 f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}."

@@ -43,7 +43,7 @@ class FrozenEncoder(nn.Module):
         self.register_buffer("std", torch.tensor(backbone.std).view(1, 3, 1, 1), persistent=False)
         self._compiled: openvino.OpenVINOEncoder | None = None
         self._of_grey: tuple[Tensor, Tensor] | None = None
-        self.model.register_load_state_dict_post_hook(lambda *_: self._forget_compiled())
+        self.model.register_load_state_dict_post_hook(self._forget_compiled)  # a method, so that a copy has its own
         self.train(False)
 
     @property
@@ -117,7 +117,7 @@ class FrozenEncoder(nn.Module):
     def _is_compiled_for(self, device: torch.device) -> bool:
         return device.type == "cpu" and openvino.is_installed() and is_native(self.precision, device)
 
-    def _forget_compiled(self) -> None:
+    def _forget_compiled(self, *_: Any) -> None:
         self._compiled = self._of_grey = None
 
     def __getstate__(self) -> dict[str, Any]:

@@ -118,15 +118,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             reduction: "mean" over all valid steps, or "none" for one loss per sample (B,).
 
         Returns:
-            The loss, and its terms as floats. In evaluation mode the translation error is also accumulated,
-            and the next call in training mode reports its mean over all valid steps as
-            `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data.
+            The loss, and its terms as floats. In evaluation mode the translation error is also accumulated, and
+            calls in training mode report its mean over all valid steps of the last evaluation as
+            `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data, and shows 0
+            for what is reported only once.
         """
         errors = self._chunk_errors(batch)
         logs = {"regression_loss": errors.regression_loss().item(), "gripper_loss": errors.gripper_loss().item()}
         if self.training:
             logs |= self._heldout_report
-            self._heldout_report = {}
         else:
             self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
         loss = errors.loss_per_sample if reduction == "none" else errors.loss
@@ -163,7 +163,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> "FrozenViTChunkPolicy":
-        """Load a checkpoint; one that holds its backbone needs no other source of weights."""
+        """Load a checkpoint; one that holds its backbone needs no other source of weights.
+
+        What an `hf/...` backbone is, and which pixels it takes, is still read from `backbone_path` or the Hub.
+        """
         return super().from_pretrained(pretrained_name_or_path, load_backbone=False, **kwargs)
 
     @classmethod
@@ -273,7 +276,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         pooled = self._pooled(batch)
         if self.config.standardize_features:
             pooled = (pooled - self.feature_mean) / self.feature_std
-        return (pooled, batch[OBS_STATE]) if self.config.use_state else (pooled,)
+        if not self.config.use_state:
+            return (pooled,)
+        if OBS_STATE not in batch:
+            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which --env.obs_type=pixels_agent_pos shows.")
+        return pooled, batch[OBS_STATE]
 
     @torch.no_grad()
     def translation_error(self, batch: dict[str, Tensor]) -> tuple[float, int]:

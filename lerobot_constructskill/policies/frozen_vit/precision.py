@@ -69,5 +69,5 @@ def is_native(precision: str, device: torch.device | str) -> bool:
 def _cpu_multiplies_bfloat16() -> bool:
     if os.environ.get(ISA_CAP, "").upper() in WITHOUT_BFLOAT16:
         return False
-    found = torch.cpu.get_capabilities()
-    return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
+    # Since 2.11 torch has this as `get_capabilities`; LeRobot takes 2.7 as well. Whatever has AMX has it for bfloat16.
+    return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()

@@ -2,7 +2,7 @@
 
 Its pixel statistics, token layout and pooled feature are the model's own; images are 224 x 224 as for every backbone.
 Without a commit behind its name a model is what the Hub's `main` holds when it is first loaded: the sha256 that is
-then recorded pins it from there on.
+then recorded pins its weights from there on, and a commit also what it is and which pixels it takes.
 """
 
 import os.path
