@@ -48,6 +48,12 @@ def test_bad_fields_are_refused_in_one_sentence(build, field, value):
     assert "\n" not in str(refused.value)
 
 
+def test_lerobot_which_films_its_evaluations_is_given_something_to_film_with():
+    ConstructSkillEnv(render_backend="none")
+    with pytest.raises(UserError, match="one of auto, gpu, cpu, not 'none'"):
+        ConstructSkillEnvConfig(render_backend="none")
+
+
 @pytest.mark.parametrize("cameras", [("wrist",), (), ("base", "lidar")])
 def test_cameras_that_an_observation_does_not_have_are_refused(cameras):
     with pytest.raises(UserError, match="must be some of base, which pixels has"):
