@@ -133,7 +133,11 @@ install_lavapipe() {
     elif [[ $(os_release ID) == debian ]] && add_backports "$codename"; then
         apt_install -t "$codename-backports" mesa-vulkan-drivers
     fi
-    new_enough "$(installed_version mesa-vulkan-drivers)" || warn "the simulator cannot render without a GPU:" \
+    new_enough "$(installed_version mesa-vulkan-drivers)" || warn_of_mesa
+}
+
+warn_of_mesa() {
+    warn "the simulator cannot render without a GPU:" \
         "it needs mesa-vulkan-drivers >= $MESA_MINIMUM and $(os_release PRETTY_NAME) offers" \
         "$(candidate_version mesa-vulkan-drivers); upgrade the system, or add a package source of your choice that has it."
 }
@@ -145,9 +149,17 @@ system_is_ready() {
     [[ -z "$(missing_packages "${PACKAGES[@]}")" ]] && new_enough "$(installed_version mesa-vulkan-drivers)"
 }
 
+# All is installed, but Mesa is old, and apt has no newer one (Ubuntu 22.04).
+is_as_ready_as_can_be() {
+    [[ -z "$(missing_packages "${PACKAGES[@]}")" && $(os_release ID) != debian ]] &&
+        ! new_enough "$(candidate_version mesa-vulkan-drivers)"
+}
+
 setup_system() {
     system_is_ready && return 0
-    if ! command -v apt-get >/dev/null; then
+    if is_as_ready_as_can_be; then
+        warn_of_mesa
+    elif ! command -v apt-get >/dev/null; then
         warn "no apt-get here: install a Vulkan loader, FFmpeg and Mesa's lavapipe >= $MESA_MINIMUM yourself."
     elif ! can_be_root; then
         warn "neither root nor sudo: ask the administrator for \`apt-get install ${PACKAGES[*]} python3-venv\`" \
@@ -275,7 +287,7 @@ setup_venv() {
     if ! is_right_python .venv/bin/python; then
         python=$(find_python)
         say "making .venv/ with $python"
-        "$UV" venv --quiet --clear --python "$python" .venv
+        "$UV" venv --quiet --clear --seed --python "$python" .venv
     fi
     say "installing the pinned packages (6 GB; about a minute on a fast line)"
     "$UV" pip install --quiet --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]" ||

@@ -4,8 +4,8 @@ Usage: python benchmarks/run.py [name ...]
 
 The names are rendering, resets, encoders, training, keypoints, evaluation, drift and scaling; all by default.
 
-Named ones are measured again and the others keep their last lines. Demonstrations and features of the fast set are
-made on the first run, in outputs/bench ($BENCH_OUT).
+Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the fast set
+are made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
@@ -42,7 +42,8 @@ def prepare() -> None:
 def measure(name: str) -> list[dict]:
     """The measurements that one benchmark prints."""
     print(f"== {name}", flush=True)
-    done = subprocess.run([BIN / "python", HERE / f"{name}.py"], stdout=subprocess.PIPE, text=True, check=True)
+    command, without_hub = [BIN / "python", HERE / f"{name}.py"], os.environ | {"HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=without_hub)
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"what"')]
     print(*lines, sep="\n", flush=True)
     return [json.loads(line) | {"benchmark": name, "machine": machine()} for line in lines]
@@ -73,7 +74,7 @@ def main(names: list[str]) -> None:
     if unknown:
         sys.exit(f"Unknown benchmark {', '.join(unknown)}; there are: {', '.join(NAMES)}.")
     prepare()
-    kept = [json.loads(line) for line in LINES.read_text().splitlines()] if names and LINES.exists() else []
+    kept = [json.loads(line) for line in LINES.read_text().splitlines()] if LINES.exists() else []
     for name in names or NAMES:
         kept = [one for one in kept if one["benchmark"] != name] + measure(name)
         write(sorted(kept, key=lambda one: NAMES.index(one["benchmark"])))

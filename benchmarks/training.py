@@ -1,6 +1,7 @@
 """Training: stock lerobot-train on features against video, and ten seeds together against ten stock runs."""
 
 import re
+import shutil
 
 from measure import LOG, OUT, report, run
 
@@ -25,6 +26,7 @@ COMMON = ["--policy.push_to_hub=false", "--policy.save_backbone=false", "--env_e
 def train(number: int, steps: int, *flags: str) -> tuple[float, float]:
     """Run lerobot-train; return its wall seconds, and samples/s once it runs (the first steps left out)."""
     folder = OUT / "train" / str(number)
+    shutil.rmtree(folder, ignore_errors=True)  # LeRobot does not train where it has trained
     seconds, _ = run(
         "lerobot-train",
         *flags,

@@ -15,9 +15,9 @@ eval=(--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false)
 
 [ -d "$OUT/demonstrations" ] || constructskill-generate smoke --episodes=1 --task="$TASK" --repo_id=local/smoke \
     --root="$OUT/demonstrations"
-[ -e "$OUT/train/checkpoints/last" ] || lerobot-train "${policy[@]}" --dataset.repo_id=local/smoke \
+[ -e "$OUT/trained" ] || { rm -rf "$OUT/train"; lerobot-train "${policy[@]}" --dataset.repo_id=local/smoke \
     --dataset.root="$OUT/demonstrations" --dataset.episodes='[0]' --batch_size=1 --num_workers=0 --steps=1 \
-    --save_freq=1 "${env[@]}" "${eval[@]}" --env_eval_freq=1 --output_dir="$OUT/train"
+    --save_freq=1 "${env[@]}" "${eval[@]}" --env_eval_freq=1 --output_dir="$OUT/train" && touch "$OUT/trained"; }
 lerobot-eval --policy.path="$OUT/train/checkpoints/last/pretrained_model" "${env[@]}" "${eval[@]}" \
     --output_dir="$OUT/eval"
 

@@ -75,6 +75,16 @@ def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
+    "call", [["doctor", "--weights=true"], ["config", "one", "two"], ["report", "--nothing"]], ids=lambda call: call[0]
+)
+def test_a_command_behind_the_overview_is_told_to_print_its_traceback(call: list[str], tmp_path: Path) -> None:
+    command = [Path(sys.executable).parent / "constructskill", *call, "--debug"]
+    done = subprocess.run(command, capture_output=True, text=True, env={"XDG_STATE_HOME": str(tmp_path)})
+    assert done.returncode == 1 and "Traceback" in done.stderr and "InputError: " in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(f"constructskill-{call[0]}: ")
+
+
+@pytest.mark.parametrize(
     ("error", "status", "said"),
     [
         ("OSError(28, 'No space left on device')", 1, "[Errno 28] No space left on device"),

@@ -51,8 +51,11 @@ class ConstructSkillBenchmark(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Choose the renderer of environments still to be made; on a CPU one thread each for it and for torch."""
-        cls._render_backend = mode
+        """Choose the renderer of environments still to be made; on a CPU one thread each for it and for torch.
+
+        The harness's default is "gpu" wherever it runs: then a GPU renders if there is one, and else the CPU.
+        """
+        cls._render_backend = "cpu" if mode == "cpu" else "auto"
         threads = {name: os.environ.get(name, "1") for name in ("LP_NUM_THREADS", "OMP_NUM_THREADS")}
         return apply_env(threads) if mode == "cpu" else {}
 

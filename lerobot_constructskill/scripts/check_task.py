@@ -15,6 +15,9 @@ from lerobot_constructskill.scripts.console import run
 TILE = 224
 """Height and width of a picture in the contact sheet, in pixels."""
 
+TESTS = Path(__file__).parents[2] / "tests"
+"""Where they lie in a checkout; an installed package has none."""
+
 REQUIRED = 0.95
 """Share of random initial states in which an expert must succeed."""
 
@@ -32,7 +35,7 @@ class CheckTaskConfig:
     noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     folder: Path = Path("outputs/check")  # where the contact sheet goes
-    tests: bool = True  # run the registry tests of this task; needs a checkout
+    tests: bool = True  # run the registry tests of this task, where this is a checkout
 
     def __post_init__(self):
         check(self)
@@ -53,7 +56,9 @@ def check_task(config: CheckTaskConfig) -> str:
     )
     if len(failures) > (1 - REQUIRED) * config.states:
         raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
-    if config.tests and (code := run_tests(config.task)):
+    if not config.tests or not TESTS.is_dir():
+        return f"{report} Its tests were not run."
+    if code := run_tests(config.task):
         raise InputError(f"{report} Its tests failed with status {code}; the output of pytest above says why.")
     return report
 
@@ -109,7 +114,8 @@ def save_contact_sheet(config: CheckTaskConfig) -> Path:
 
 def run_tests(task: str) -> int:
     """Exit status of every test that names `task`."""
-    return subprocess.run([sys.executable, "-m", "pytest", "-q", "-k", f"[{task}]"], check=False).returncode
+    command = [sys.executable, "-m", "pytest", "-q", "-k", f"[{task}]", str(TESTS)]
+    return subprocess.run(command, check=False, cwd=TESTS.parent).returncode
 
 
 def main() -> None:

@@ -1,10 +1,8 @@
 """`constructskill-config`: list this package's configurations, or print the path of one, for `lerobot-train`."""
 
-import argparse
-
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.presets import KINDS, description, find, names
-from lerobot_constructskill.scripts.console import EPILOG, edge
+from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
 
 
 def show(name: str | None = None) -> str:
@@ -23,7 +21,7 @@ def show(name: str | None = None) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="constructskill-config",
         description="Print the path of a shipped configuration, or list them all. "
         "As in: lerobot-train --config_path=$(constructskill-config train/act)",
@@ -31,10 +29,7 @@ def main() -> None:
     )
     parser.add_argument("name", nargs="?", help=f"{'/NAME, '.join(KINDS)}/NAME; all are listed without it")
     with edge():
-        arguments, unknown = parser.parse_known_args()
-        if unknown:
-            raise InputError(f"unrecognized arguments: {' '.join(unknown)}")
-        print(show(arguments.name))
+        print(show(parser.parse_args().name))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The edge of the console commands: a configuration from flags and YAML, and whatever goes wrong as one sentence."""
 
+import argparse
 import logging
 import os
 import shlex
@@ -9,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
+from typing import NoReturn
 
 from lerobot_constructskill.errors import InputError, UserError, full_traceback, remedy_of
 from lerobot_constructskill.presets import find, names
@@ -18,6 +20,13 @@ REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 
 DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
+
+
+class Parser(argparse.ArgumentParser):
+    """Of a command without a configuration: what it cannot parse is one sentence too."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
 
 
 def run[Config](config_class: type[Config], action: Callable[[Config], str], presets: str | None = None) -> None:

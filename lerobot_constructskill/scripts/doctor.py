@@ -1,14 +1,13 @@
 """`constructskill-doctor`: say what is wrong with a machine; one line for each check."""
 
-import argparse
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from importlib import metadata
 
-from lerobot_constructskill.errors import DISTRIBUTION, InputError, plural
-from lerobot_constructskill.scripts.console import EPILOG, edge
+from lerobot_constructskill.errors import DISTRIBUTION, plural
+from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
 from lerobot_constructskill.scripts.doctor_checks import (
     Finding,
     Level,
@@ -171,7 +170,7 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="constructskill-doctor",
         description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin, the pretrained weights "
         "and the encoder's speed on this machine (about a minute). Exit status 1 where something fails.",
@@ -181,10 +180,7 @@ def main() -> None:
         "--weights", action="store_true", help="fetch the weights of every backbone instead, check and name them"
     )
     with edge():
-        asked, unknown = parser.parse_known_args()
-        if unknown:
-            raise InputError(f"unrecognized arguments: {' '.join(unknown)}")
-        sys.exit(diagnose(fetching() if asked.weights else CHECKS))
+        sys.exit(diagnose(fetching() if parser.parse_args().weights else CHECKS))
 
 
 if __name__ == "__main__":

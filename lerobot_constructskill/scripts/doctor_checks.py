@@ -16,7 +16,7 @@ DEMO_FRAMES = 5_381
 """What `constructskill-generate fast_shifted_wrist --episodes=50` makes."""
 
 REINSTALL = f"pip install --force-reinstall --no-deps '{DISTRIBUTION}', or the checkout's folder in its place"
-RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1 (Debian 12: from its backports)"
+RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1 (Debian 12: from its backports; Ubuntu: 24.04 or newer)"
 
 OPENCV = (
     "opencv-python",

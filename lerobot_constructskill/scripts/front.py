@@ -6,7 +6,7 @@ from importlib import import_module, metadata
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.errors import DISTRIBUTION, InputError
-from lerobot_constructskill.scripts.console import EPILOG, edge
+from lerobot_constructskill.scripts.console import DEBUG, EPILOG, edge
 
 PREFIX = "constructskill-"
 RELIES_ON = ("lerobot", "torch", "mani_skill", "sapien")
@@ -48,6 +48,7 @@ def find(name: str) -> metadata.EntryPoint:
 
 
 def main() -> None:
+    debug = [DEBUG] * (DEBUG in sys.argv)  # which `edge` takes out
     with edge():
         match sys.argv[1:]:
             case [] | ["-h" | "--help"]:
@@ -56,7 +57,7 @@ def main() -> None:
                 return print(tell_versions())
             case [name, *flags]:
                 command = find(name)
-                sys.argv = [command.name, *flags]
+                sys.argv = [command.name, *flags, *debug]
     command.load()()
 
 
