@@ -60,8 +60,9 @@ class Memoryless:
         state, error = stance.state, self._release_error(stance)
         near = (state.bin_interior + state.object_size)[:2] / 2 + RISEN
         height = max(0.0, (abs(error[:2]) - near).max())
-        room = self._lifted(state)[2] - self.config.threshold - state.tcp[2]
-        lacking = error[2] + height if error[2] > 0 else min(error[2] + height, room)
+        # Far out the arm may not reach as high as the release, and has to come nearer first.
+        most = self._highest(state.tcp) if error[2] > 0 else self._lifted(state)[2]
+        lacking = min(error[2] + height, most - self.config.threshold - state.tcp[2])
         return float(np.clip(lacking / (RISEN + height / 2), 0, 1))
 
     def _lifted(self, state: PrivilegedState) -> np.ndarray:

@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOMEM, ENOSPC, EROFS
+from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import partial
 from pathlib import Path
 
@@ -30,11 +30,14 @@ from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import trainer_of
+from lerobot_constructskill.training.trainers import NO_MEMORY, trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
 FILMED_SEED = 0
+
+OF_THE_MACHINE = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
+"""What an `OSError` says of the machine, its disks and its network."""
 
 
 @dataclass(frozen=True)
@@ -101,8 +104,16 @@ def _let_through(error: Exception) -> None:
     """Raise what is no run's fault and may be gone the next time, so that it never stands for the run's result."""
     if isinstance(error, TakenError | MachineError | MemoryError):
         raise error
-    if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM):
+    causes = [error, *_causes(error)]
+    if any(isinstance(one, OSError) and one.errno in OF_THE_MACHINE for one in causes):
         raise error
+    if any(isinstance(one, RuntimeError) and any(words in str(one) for words in NO_MEMORY) for one in causes):
+        raise error
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    while (error := error.__cause__ or error.__context__) is not None:
+        yield error
 
 
 def _fit(job: Job, runs: Sequence[Run]) -> None:

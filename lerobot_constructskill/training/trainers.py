@@ -25,6 +25,9 @@ from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 KILLED = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 """What ends a process from outside: somebody, or the kernel for want of memory. No policy ends itself like this."""
 
+NO_MEMORY = ("can't allocate memory", "out of memory")
+"""What torch says in a `RuntimeError` for want of it, on a CPU and on a GPU."""
+
 LOADERS = 4
 """LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
 
@@ -170,7 +173,7 @@ def _call(command: list[str]) -> str:
 
     Raises:
         RuntimeError: it failed; all that it said is the exception's note.
-        MachineError: it was killed.
+        MachineError: it, or a process of its own, was killed or ran out of memory.
     """
     done = subprocess.run(
         command,
@@ -183,6 +186,8 @@ def _call(command: list[str]) -> str:
     if -done.returncode in KILLED:
         name = signal.Signals(-done.returncode).name
         raise MachineError(f"lerobot-train was killed ({name}), for want of memory perhaps; the same command goes on.")
+    if done.returncode and any(words in done.stdout for words in (*NO_MEMORY, "killed by signal")):
+        raise MachineError("lerobot-train, or a process of its own, ran out of memory; the same command goes on.")
     if done.returncode:
         lines = done.stdout.strip().splitlines() or ["nothing"]
         error = RuntimeError(f"lerobot-train ended with status {done.returncode} and said last: {lines[-1]}")

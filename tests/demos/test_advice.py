@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 from disturbances import DISTURBANCES, recover
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED, GRIPPER_OPEN, TASKS, get_task
+from lerobot_constructskill.contract import (
+    ACTION_SCALE,
+    GRIPPER_CLOSED,
+    GRIPPER_OPEN,
+    ROBOT_BASE,
+    TASKS,
+    get_task,
+)
 from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.stance import JAW, OPENED, Stance
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -121,6 +128,35 @@ def test_where_nothing_helps_the_hand_opens_rises_and_waits(advised):
         assert advice.action[-1] == GRIPPER_OPEN and advice.action[2] >= 0 and not advice.action[:2].any()
         risen = replace(state, tcp_pose=np.array([*state.tcp[:2], 1.0, *state.tcp_pose[3:]]))
         assert not advised[1].advise(risen).action[:-1].any()
+
+
+@pytest.mark.parametrize("off", [0.0, 0.015, 0.029])
+@pytest.mark.parametrize("place", [(0.1, 0.1), (0.1, -0.1), (0.12, 0.1), (-0.1, 0.1), (0.0, 0.0)], ids=str)
+@pytest.mark.parametrize("task", [name for name in TASKS if name.startswith("bri")])
+def test_a_brick_held_where_the_arm_reaches_no_higher_still_comes_to_the_bin(task, place, off):
+    """A hand without dynamics holds it so far outward of its middle, and goes 0.35 m for each metre it is told."""
+    expert, size = make_expert(get_task(task), ExpertConfig()), np.array([0.21, 0.065, 0.10])
+    _, interior, height = SCENES.get(task, (size, [0.25, 0.20, 0.15], 0.08))
+    outward = np.array(place) - ROBOT_BASE[:2]
+    middle = np.array([*place, size[2] / 2])
+    tcp = middle + [*off * outward / np.linalg.norm(outward), size[2] / 2 - ExpertConfig().finger_depth]
+    state = PrivilegedState(
+        tcp_pose=np.array([*tcp, 0, 1, 0, 0]),
+        fingers=np.full(2, size[1] / 2),
+        object_pose=np.array([*middle, 1, 0, 0, 0]),
+        object_size=size,
+        object_mass=np.array([1.0]),
+        bin_position=np.array([0, -0.35, height]),
+        bin_interior=np.array(interior),
+    )
+    sag = expert._weight_compensation(state)
+    for _ in range(200):
+        advice = expert.advise(state)
+        if advice.phase is Phase.RELEASE:
+            return
+        moved = np.array([*0.35 * (advice.action[:3] - sag), 0, 0, 0, 0])
+        state = replace(state, tcp_pose=state.tcp_pose + moved, object_pose=state.object_pose + moved)
+    pytest.fail(f"it stays at {state.tcp} in {advice.phase}")
 
 
 @pytest.mark.sim

@@ -3,10 +3,12 @@
 import json
 import shutil
 from dataclasses import replace
+from errno import ENOENT, ENOSPC, ESTALE
 from pathlib import Path
 
 import pandas as pd
 import pytest
+import torch
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
@@ -15,7 +17,7 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
-from lerobot_constructskill.study.execute import EPISODES
+from lerobot_constructskill.study.execute import EPISODES, _let_through
 from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
@@ -503,3 +505,33 @@ def test_a_cut_study_is_made_of_the_same_runs():
     cut = replace(whole, seeds=2).study
     assert {name: variant.seeds for name, variant in cut.variants.items()} == {"a": 2, "b": 2}
     assert not changed(whole.study, cut)
+
+
+def _wrapped(cause: Exception) -> Exception:
+    try:
+        raise ValueError("An error occurred while generating the dataset") from cause
+    except ValueError as error:
+        return error
+
+
+@pytest.mark.parametrize(
+    ("error", "is_the_machines"),
+    [
+        (_wrapped(OSError(ENOSPC, "No space left on device")), True),
+        (OSError(ESTALE, "Stale file handle"), True),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
+            True,
+        ),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), True),
+        (RuntimeError("shape mismatch"), False),
+        (_wrapped(FileNotFoundError(ENOENT, "no weights")), False),
+    ],
+    ids=str,
+)
+def test_what_the_machine_lacks_is_no_result_of_a_run(error, is_the_machines):
+    if is_the_machines:
+        with pytest.raises(type(error)):
+            _let_through(error)
+    else:
+        _let_through(error)

@@ -15,6 +15,14 @@ from lerobot_constructskill.training.checkpoints import writing_checkpoint
 from lerobot_constructskill.training.trainers import _call
 
 
+@pytest.mark.parametrize("said", ["CUDA out of memory.", "worker (pid 7) is killed by signal: Killed."])
+def test_a_training_without_memory_is_the_machines_doing(said):
+    with pytest.raises(MachineError, match="ran out of memory"):
+        _call([sys.executable, "-c", f"import sys; sys.exit({said!r})"])
+    with pytest.raises(RuntimeError, match="said last: diverged"):
+        _call([sys.executable, "-c", "import sys; sys.exit('diverged')"])
+
+
 @pytest.mark.parametrize("signal", ["SIGKILL", "SIGTERM"])
 def test_a_training_that_was_killed_is_the_machines_doing(signal):
     ending = f"import os, signal; os.kill(os.getpid(), signal.{signal})"
