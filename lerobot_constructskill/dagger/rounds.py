@@ -71,7 +71,8 @@ def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpiso
     made = plan.evaluation(number)
     with store.claim([made]) as missing:
         if missing:
-            alone = Drive(number, beta=0.0, patience=plan.env["episode_length"] + 1)  # nobody gives up for it
+            never = plan.env["episode_length"] + 1  # nobody gives up for it
+            alone = Drive(number, beta=0.0, patience=never, pictures=False)
             outcomes = [DrivenEpisode.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
             with store.writing(made) as folder:
                 folder.mkdir()

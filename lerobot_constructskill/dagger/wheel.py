@@ -25,11 +25,13 @@ class Drive:
         number: the round's, for its frames.
         beta: probability of the expert's action in a step.
         patience: hopeless steps in a row after which an episode ends; they are dropped.
+        pictures: whether frames keep what the cameras saw, a megabyte every three steps.
     """
 
     number: int
     beta: float
     patience: int
+    pictures: bool = True
 
 
 @dataclass
@@ -49,7 +51,7 @@ class Episode:
         executed = advice.action if expert else as_executed(proposed)
         self.hopeless = self.hopeless + 1 if advice.hopeless else 0
         self.frames.append(
-            seen(self.now.seen["pixels"], self.now.agent_state, self.now.sim)
+            seen(self.now.seen["pixels"] if drive.pictures else {}, self.now.agent_state, self.now.sim)
             | decided(advice.action, advice.action, executed, advice.phase, self.seed)
             | {
                 "dagger.round": np.array([drive.number], dtype=np.int64),
