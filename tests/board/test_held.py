@@ -8,7 +8,9 @@ bits of physics. States are compared to a micrometre, pictures and videos by the
 
 import hashlib
 import json
+import sys
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -88,10 +90,21 @@ def test_the_videos_of_a_demonstration_have_not_changed(tmp_path):
     assert videos(tmp_path / "set") == held("pictures")["videos"]
 
 
-if __name__ == "__main__":
+def record_anew() -> None:
+    """Hold what this machine comes to, for its make of processor."""
     recorded, executed = json.loads(RECORDED.read_text()), {task: execute(task) for task in TASKS}
-    recorded["states"][make()] = {task: states for task, (states, _, _) in executed.items()}
     with TemporaryDirectory() as scratch:
         filmed = {"videos": videos(Path(scratch, "set"))}
-    recorded["pictures"][make()] = {task: frames for task, (_, frames, _) in executed.items()} | filmed
+    pictures = {task: frames for task, (_, frames, _) in executed.items()} | filmed
+    ours = version("lerobot_env_constructskill")
+    if recorded["pictures"].get(make(), pictures) != pictures and recorded["version"] == ours:
+        sys.exit(
+            f"Pictures changed since {ours}: raise the version in pyproject.toml, by which stores tell them apart."
+        )
+    recorded["states"][make()] = {task: states for task, (states, _, _) in executed.items()}
+    recorded["pictures"][make()], recorded["version"] = pictures, ours
     RECORDED.write_text(json.dumps(recorded, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    record_anew()
