@@ -11,6 +11,7 @@ import pytest
 import yaml
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.optim import AdamWConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 import lerobot_constructskill.plugin  # noqa: F401
@@ -24,7 +25,10 @@ from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.rows import VARIANT
 from lerobot_constructskill.study.runs import list_runs
+from lerobot_constructskill.study.spec import Study
+from lerobot_constructskill.training.recipe import Training
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
@@ -140,6 +144,17 @@ def test_the_papers_study_holds_its_52_runs():
     assert set(combinations(backbones, 2)) <= {
         pair for a, b in config.analysis.comparisons for pair in ((a, b), (b, a))
     }
+
+
+def test_the_papers_recipe_is_the_papers():
+    """Spec, sections 4 and 5: what paper.yaml leaves to defaults, as numbers of their own."""
+    config = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[])
+    arms = {run.arm.name: run.arm for run in list_runs(config.study) if run.arm.role == VARIANT}
+    for name in arms.keys() - {"converged"}:
+        policy, optimizer = arms[name].policy, arms[name].policy.get_optimizer_preset()
+        assert arms[name].training == Training(epochs=150, batch_size=256, holdout=8)
+        assert (type(optimizer), optimizer.lr) == (AdamWConfig, 1e-3) and policy.get_scheduler_preset() is None
+    assert Study.__dataclass_fields__["episodes"].default == 10
 
 
 def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():

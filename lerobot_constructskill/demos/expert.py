@@ -95,7 +95,8 @@ class ExpertConfig:
         grasp_dwell: steps spent closing the gripper.
         release_dwell: most steps spent above the bin with the gripper open.
         pregrasp_clearance: height above the grasp at which PREGRASP ends, in metres.
-        lift_height: how far LIFT rises, in metres (paper, section II).
+        lift_height: how far LIFT rises, in metres (paper, section II), or as high as the arm reaches: 0.24 m in the
+            far corner of `brick_to_bin_shifted`.
         release_clearance: gap between the object and the bin's rim at RELEASE, in metres.
         finger_depth: how far below the object's top the finger tips grasp, in metres.
 

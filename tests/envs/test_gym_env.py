@@ -16,6 +16,7 @@ from lerobot.envs.utils import (
     env_to_policy_features,
     preprocess_observation,
 )
+from scipy.spatial.transform import Rotation
 
 from lerobot_constructskill.contract import ACTION_SCALE, IMAGE_SIZE, OBS_TYPES, SUITES, TASKS
 from lerobot_constructskill.demos.demonstrate import demonstrate
@@ -52,6 +53,25 @@ def test_lerobot_which_films_its_evaluations_is_given_something_to_film_with():
     ConstructSkillEnv(render_backend="none")
     with pytest.raises(UserError, match="one of auto, gpu, cpu, not 'none'"):
         ConstructSkillEnvConfig(render_backend="none")
+
+
+@pytest.mark.sim
+def test_the_state_is_a_position_an_axis_angle_and_two_fingers():
+    env = ConstructSkillEnv("brick_to_bin_turned", "pixels_agent_pos", render_backend="none")
+    env.reset(seed=0)
+    for _ in range(8):
+        state = env.step(np.array([0.02, 0.0, 0.03, 0.08, 1.0]))[0]["agent_pos"]
+    w, *xyz = env.privileged_state()["tcp_pose"][3:]
+    turn = Rotation.from_rotvec(state[3:6]).inv() * Rotation.from_quat([*xyz, w])
+    assert turn.magnitude() < 1e-3 and state[3] > 0 and abs(state[4]) > 0.01
+    robot = env._env.unwrapped.agent.robot
+    qpos = robot.get_qpos()
+    names = [joint.name for joint in robot.active_joints]
+    for name, value in (("panda_finger_joint1", 0.01), ("panda_finger_joint2", 0.03)):
+        qpos[:, names.index(name)] = value
+    robot.set_qpos(qpos)
+    np.testing.assert_allclose(env.agent_state()[6:], [0.01, 0.03], atol=1e-6)
+    env.close()
 
 
 @pytest.mark.parametrize("cameras", [("wrist",), (), ("base", "lidar")])

@@ -62,6 +62,20 @@ def test_a_backbone_is_pinned_to_a_commit_or_to_the_content_of_a_package(name):
     assert pins and all(re.fullmatch(r"[0-9a-f]{40}|[0-9a-f]{64}", pin) for pin in pins)
 
 
+def test_the_papers_four_backbones_are_its_four():
+    """Paper, section II; of the two ViT-Tiny only the pixel statistics differ."""
+    imagenet, half = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)), ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+    clip = ((0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711))
+    tiny = "timm/vit_tiny_patch16_224.augreg_in21k_ft_in1k"
+    assert {name: (spec.repo_id, spec.mean, spec.std) for name, spec in BACKBONES.items() if spec.repo_id} == {
+        "dinov2_vits14": ("facebook/dinov2-small", *imagenet),
+        "clip_vitb16": ("openai/clip-vit-base-patch16", *clip),
+        "vit_tiny16": (tiny, *imagenet),
+        "vit_tiny16_augreg": (tiny, *half),
+    }
+    assert BACKBONES["vit_tiny16"].revision == BACKBONES["vit_tiny16_augreg"].revision
+
+
 def test_pixels_are_resized_and_normalised_with_the_backbones_own_statistics():
     grey = torch.full((1, 3, 100, 150), 0.5)
     for name in ("vit_tiny16", "vit_tiny16_augreg"):

@@ -170,6 +170,17 @@ def test_the_heldout_error_is_reported_in_training_until_the_next(make_policy, m
         assert one["heldout_translation_mse_m2"] == pytest.approx(torch.cat(errors).mean().item(), rel=1e-5)
 
 
+@pytest.mark.parametrize("logit", [-30.0, 0.5, 30.0])
+def test_a_translation_is_a_tenth_of_a_metre_times_tanh(make_policy, images, logit):
+    """Paper, section II."""
+    policy = make_policy().eval()
+    with torch.no_grad():
+        policy.heads.translation.weight.zero_()
+        policy.heads.translation.bias.fill_(logit)
+    chunk = policy.predict_action_chunk({"observation.images.base": images})
+    torch.testing.assert_close(chunk[..., :3], torch.full_like(chunk[..., :3], 0.1 * math.tanh(logit)))
+
+
 def test_features_give_the_same_action_as_the_image(make_policy, images):
     policy = make_policy().eval()
     feature = policy.backbone(images)

@@ -15,6 +15,7 @@ from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
+from lerobot_constructskill.sim.tasks.block import BlockToBinEnv
 from lerobot_constructskill.sim.tasks.brick_on_brick import TOLERANCE
 
 pytestmark = pytest.mark.sim
@@ -162,6 +163,27 @@ def test_asking_twice_changes_no_outcome(blind):
         first, second = blind.evaluate(), blind.evaluate()
         assert all(torch.equal(first[name], second[name]) for name in first)
     assert not first["success"]
+
+
+def test_lifted_is_a_centre_at_15_cm_and_open_both_fingers_at_38_mm(blind):
+    """Paper, section III."""
+    blind.reset(seed=0)
+    for height, lifted in ((0.149, False), (0.151, True)):
+        move_object(blind, [0.3, 0.3, height])
+        assert blind.evaluate()["is_lifted"].item() == lifted
+    for fingers, is_open in (((0.0375, 0.04), False), ((0.04, 0.0375), False), ((0.0385, 0.0385), True)):
+        qpos = blind.agent.robot.get_qpos()
+        qpos[:, -2:] = torch.tensor(fingers)
+        blind.agent.robot.set_qpos(qpos)
+        assert blind.evaluate()["is_gripper_open"].item() == is_open
+    assert PLACED_STEPS == 5
+
+
+def test_a_new_task_is_an_asset_four_constants_and_its_initial_states():
+    """Spec, section 1: the promise that other construction tasks are cheap, held on the one that was added for it."""
+    constants = {"object_size", "object_center", "bin_center", "bin_interior"}
+    own = {name for name in vars(BlockToBinEnv) if not name.startswith("__")}
+    assert own <= constants | {"_load_object", "spawn_range", "yaw_range"} and "__init__" not in vars(BlockToBinEnv)
 
 
 def test_lifted_holds_for_the_rest_of_the_episode_and_not_for_the_next(blind):

@@ -74,7 +74,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             samples. Needs a feature set, whose statistics go into the checkpoint; they are
             those that LeRobot computes, of the whole data set, episodes held out for evaluation included. Only
             for the readout "cls".
-        use_state: whether the heads also see the normalised `observation.state`.
+        use_state: whether the heads also see `observation.state`, normalised by the statistics of the whole data set,
+            episodes held out for evaluation included.
         head_hidden_dim: width of the hidden layers (GELU) in each of the two heads; None makes them linear, as the
             paper does.
         head_hidden_layers: how many hidden layers each head has, where it has any.

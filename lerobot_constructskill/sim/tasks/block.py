@@ -1,4 +1,4 @@
-"""Concrete block to bin: the extension promise, one asset and four geometry constants."""
+"""Concrete block to bin: the extension promise, one asset, four geometry constants and its initial states."""
 
 import numpy as np
 from mani_skill.utils.building import ActorBuilder
