@@ -16,7 +16,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_constructskill.artifacts.digests import distributions_of
+from lerobot_constructskill.artifacts.digests import distributions_of, file_sha256
 from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import MachineError
@@ -114,10 +114,16 @@ def packages_of(config: PreTrainedConfig) -> tuple[str, ...]:
 
 
 def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
-    """Every field of a settled configuration that shows in its checkpoint."""
+    """Every field of a settled configuration that shows in its checkpoint.
+
+    A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for whatever it
+    holds, unless `pretrained_revision` says which commit.
+    """
     fields = draccus.encode(config)
     for name in (*ELSEWHERE, *trainer_of(config).places):
         fields.pop(name, None)
+    if config.pretrained_path and (weights := Path(config.pretrained_path) / "model.safetensors").is_file():
+        fields["pretrained_path"] = f"sha256 {file_sha256(weights)}"
     return {"type": config.type, **fields}
 
 

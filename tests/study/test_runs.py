@@ -183,6 +183,16 @@ def test_another_policy_recipe_or_data_set_is_another_run(fields):
     assert "fixed/a/seed_0" in changed(study(), study(**fields))
 
 
+def test_what_training_starts_from_is_told_by_its_weights(tmp_path):
+    def begun(folder: str, weights: bytes) -> dict[str, str]:
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "model.safetensors").write_bytes(weights)
+        return digests(study(variants={"a": Variant(ACT | {"pretrained_path": str(tmp_path / folder)}, seeds=1)}))
+
+    first = begun("base", b"one")
+    assert begun("moved", b"one") == first != begun("base", b"another")
+
+
 def test_an_edited_generator_file_runs_exactly_what_depends_on_it(tmp_path):
     paths = [tmp_path / "one.yaml", tmp_path / "two.yaml"]
     for path in paths:
