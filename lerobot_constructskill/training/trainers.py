@@ -116,8 +116,8 @@ def packages_of(config: PreTrainedConfig) -> tuple[str, ...]:
 def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
     """Every field of a settled configuration that shows in its checkpoint.
 
-    A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for whatever it
-    holds, unless `pretrained_revision` says which commit.
+    A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for whatever
+    it holds, unless `pretrained_revision` says which commit.
     """
     fields = draccus.encode(config)
     for name in (*ELSEWHERE, *trainer_of(config).places):
