@@ -63,8 +63,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_) -> st
 
 
 def on_page_content(html: str, page: Page, **_) -> str:
-    """Leave the changelog out of the search's index: what was before is rarely what is sought."""
-    if page.file.src_uri == "CHANGELOG.md":
+    """Leave the changelog and the reports out of the search's index: docs/results.md says what the reports hold."""
+    if page.file.src_uri == "CHANGELOG.md" or page.file.src_uri.startswith("results/"):
         page.meta["search"] = {"exclude": True}
     return html
 

@@ -105,5 +105,5 @@ def test_a_difference_on_another_make_of_processor_is_told_as_such(tmp_path):
         versions = declared["versions"] | {"processor": name}
         write_submission(tmp_path / name, claims, **declared | {"versions": versions})
         told = call("constructskill-verify", f"--root={tmp_path / name}", fails=True)
-        assert "1 of 4 replayed episodes are not as claimed" in told and "lifted is False, not True" in told
+        assert "1 of 10 replayed episodes are not as claimed" in told and "lifted is False, not True" in told
         assert ("processor 'AnotherMake' there" in told) == ("verify it on the make" in told) == is_told
