@@ -6,6 +6,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 import yaml
 
+import lerobot_constructskill.plugin  # noqa: F401  reads `!policy`
 from lerobot_constructskill.analysis.report import ink
 from lerobot_constructskill.scripts.report import ReportConfig, report
 
