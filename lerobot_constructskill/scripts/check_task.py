@@ -15,8 +15,8 @@ from lerobot_constructskill.scripts.console import run
 TILE = 224
 """Height and width of a picture in the contact sheet, in pixels."""
 
-TESTS = Path(__file__).parents[2] / "tests"
-"""Where they lie in a checkout; an installed package has none."""
+CHECKOUT = Path(__file__).parents[2]
+"""Where this lies in one, with its tests; an installed package has none."""
 
 REQUIRED = 0.95
 """Share of random initial states in which an expert must succeed."""
@@ -56,7 +56,7 @@ def check_task(config: CheckTaskConfig) -> str:
     )
     if len(failures) > (1 - REQUIRED) * config.states:
         raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
-    if not config.tests or not TESTS.is_dir():
+    if not config.tests or not (CHECKOUT / "pyproject.toml").is_file():
         return f"{report} Its tests were not run."
     if code := run_tests(config.task):
         raise InputError(f"{report} Its tests failed with status {code}; the output of pytest above says why.")
@@ -114,8 +114,8 @@ def save_contact_sheet(config: CheckTaskConfig) -> Path:
 
 def run_tests(task: str) -> int:
     """Exit status of every test that names `task`."""
-    command = [sys.executable, "-m", "pytest", "-q", "-k", f"[{task}]", str(TESTS)]
-    return subprocess.run(command, check=False, cwd=TESTS.parent).returncode
+    command = [sys.executable, "-m", "pytest", "-q", "-k", f"[{task}]", "tests"]
+    return subprocess.run(command, check=False, cwd=CHECKOUT).returncode
 
 
 def main() -> None:
