@@ -29,7 +29,7 @@ SHORT = {
 """Command to the flags that shorten it."""
 
 NOT_RUN = {
-    "pip install": "changes the environment that the tests run in",
+    "uv pip install": "changes the environment that the tests run in",
     "uv venv": "makes an environment with another LeRobot",
     "/tmp/other/": "runs in that environment",
     "examples/smoke_evaluation.sh": "needs the checkout: tests/test_lerobots_evaluation.py",
