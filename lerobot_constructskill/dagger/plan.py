@@ -10,6 +10,7 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact
 from lerobot_constructskill.contract import Task, get_task
 from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.envs.gym_env import resolve_rendering
@@ -100,6 +101,7 @@ class Plan:
             "beta": self.config.beta(number),
             "seeds": [self.seeds(number).start, self.config.episodes],
             "expert": vars(self.base.expert),
+            "advice": REVISION,
             "environment": self.env,
             "patience": self.config.patience,
         }
