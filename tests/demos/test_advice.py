@@ -1,7 +1,12 @@
 """Advice from the state alone: pure and sane in thousands of random states, and followed to success from disturbed
-ones."""
+ones.
 
+What it was when its revision was recorded is held: `python tests/demos/test_advice.py` records another.
+"""
+
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +20,14 @@ from lerobot_constructskill.contract import (
     TASKS,
     get_task,
 )
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
+from lerobot_constructskill.demos.advice import REVISION
+from lerobot_constructskill.demos.expert import Advice, Expert, ExpertConfig, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.stance import JAW, OPENED, Stance
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 STATES = 1000
 SEED = 3_000_000
+HELD = Path(__file__).with_name("advice.json")
 
 SCENES = {
     "brick_on_brick": ([0.21, 0.065, 0.10], [0.22, 0.075, 0.04], 0.12),
@@ -71,12 +78,29 @@ def turned(tilt, yaw):
     return [np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b) * np.sin(a), np.sin(b) * np.cos(a)]
 
 
+def advise(task) -> tuple[Expert, list[tuple[PrivilegedState, Advice]]]:
+    """An expert, and random states with its advice."""
+    expert, rng = make_expert(get_task(task), ExpertConfig()), np.random.default_rng(0)
+    states = [random_state(task, rng) for _ in range(STATES)]
+    return expert, [(state, expert.advise(state)) for state in states]
+
+
+def total(pairs) -> list[float]:
+    """The sum of all actions: other advice in one of the states is another sum."""
+    return sum(advice.action.astype(float) for _, advice in pairs).round(6).tolist()
+
+
 @pytest.fixture(scope="module", params=TASKS)
 def advised(request):
-    """An expert, and random states with its advice."""
-    expert, rng = make_expert(get_task(request.param), ExpertConfig()), np.random.default_rng(0)
-    states = [random_state(request.param, rng) for _ in range(STATES)]
-    return request.param, expert, [(state, expert.advise(state)) for state in states]
+    return request.param, *advise(request.param)
+
+
+def test_other_advice_has_another_revision(advised):
+    """Rounds of DAgger are found by the revision: those of other advice must not be taken for today's."""
+    task, _, pairs = advised
+    held = json.loads(HELD.read_text())
+    assert held["revision"] == REVISION, "record what is advised now"
+    np.testing.assert_allclose(total(pairs), held[task], atol=1e-3, err_msg="raise demos.advice.REVISION, and record")
 
 
 def test_advice_is_a_pure_function_within_bounds(advised):
@@ -170,3 +194,8 @@ def test_the_advice_is_followed_to_success_from_disturbed_states(task):
     lost = {name for name, (success, _, hopeless) in outcomes.items() if not success}
     assert lost <= UNSOLVABLE | ({"turned", "off_centre"} if task in TIGHT else set())
     assert task in TIGHT or all(outcomes[name][2] for name in lost), "lost, and not said to be hopeless"
+
+
+if __name__ == "__main__":
+    held = {"revision": REVISION} | {task: total(advise(task)[1]) for task in TASKS}
+    HELD.write_text(json.dumps(held, indent=1) + "\n")
