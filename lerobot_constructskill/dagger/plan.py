@@ -38,8 +38,10 @@ class Plan:
     def base(self) -> GenerateConfig:
         flags = ["--repo_id=local/any", f"--workers={self.config.workers}"]
         base = parse_named(GenerateConfig, "generate", self.config.base, flags)
-        if base.labels != "clean":
-            raise InputError(f"The base '{self.config.base}' has executed actions as labels; DAgger needs clean ones.")
+        if base.labels == "executed":
+            raise InputError(
+                f"The base '{self.config.base}' has executed actions as labels; DAgger needs the expert's."
+            )
         return base
 
     @cached_property

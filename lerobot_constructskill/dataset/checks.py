@@ -15,12 +15,13 @@ from lerobot_constructskill.contract import (
     GRIPPER_OPEN,
     REWARD_LIFTED,
     REWARD_PLACED,
+    SIM_STATE,
     get_task,
 )
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
 from lerobot_constructskill.dataset.rounds import check_rounds
-from lerobot_constructskill.demos.expert import Phase
+from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.modality import MODALITY
@@ -116,8 +117,10 @@ def check_noise(data: DataSet) -> Iterator[str]:
     executed, added = data.column("dart.executed_action"), data.column("dart.noise")
     clean = executed.copy()
     clean[:, :3] -= added
-    wanted = clean if config.labels == "clean" else executed
     experts = data.rounds == 0
+    wanted = (executed if config.labels == "executed" else clean).copy()
+    if config.labels == "advice":
+        wanted[experts] = _advice(data, experts)
     off = np.abs(data.column("action") - wanted)
     if off[experts].max(initial=0) > 1e-6 or off[:, :3].max() > 1e-6:
         yield f"action is not the {config.labels} action that the provenance says its labels are."
@@ -134,6 +137,14 @@ def check_noise(data: DataSet) -> Iterator[str]:
             spread = ", ".join(f"{1000 * value:.1f}" for value in added[rows].std(axis=0))
             model = config.noise.model
             yield f"The noise in {phase} (std {spread} mm) is not what the {model} model draws from the seed."
+
+
+def _advice(data: DataSet, rows: np.ndarray) -> np.ndarray:
+    """What the expert advises in some frames, (n, action)."""
+    expert = make_expert(get_task(data.config.task), data.config.expert)
+    known = {name: data.column(f"sim.{name}")[rows].reshape(rows.sum(), -1) for name in SIM_STATE}
+    states = (PrivilegedState(**{name: values[row] for name, values in known.items()}) for row in range(rows.sum()))
+    return np.stack([expert.advise(state).action for state in states])
 
 
 def check_episodes(data: DataSet) -> Iterator[str]:

@@ -23,7 +23,7 @@ def demonstrate(
     """Run one attempt from the initial state of `seed`, whose noise is a function of `seed` too.
 
     Args:
-        labels: whether `action` is the expert's `clean` command or what was `executed`.
+        labels: one of `settings.LABELS`: what `action` is.
         stop_at_success: whether it ends with the placement, or when the expert has finished.
         watch: called before every step with the phase it belongs to and the observation, and at the end with None and
             the last observation.
@@ -38,7 +38,8 @@ def demonstrate(
     progress = expert.start(PrivilegedState(**sim))
     frames, success, is_over = [], False, False
     while not is_over:
-        clean, phase, progress = expert.act(PrivilegedState(**sim), progress)
+        state = PrivilegedState(**sim)
+        clean, phase, progress = expert.act(state, progress)
         if watch:
             watch(phase, obs)
         executed = execute(clean, phase, noise, rng)
@@ -46,7 +47,7 @@ def demonstrate(
         obs, reward, success, truncated, _ = env.step(executed)
         is_over = progress is None or truncated or (success and stop_at_success)
         sim = env.privileged_state()
-        label = clean if labels == "clean" else executed
+        label = expert.advise(state).action if labels == "advice" else clean if labels == "clean" else executed
         frames.append(before | decided(label, clean, executed, phase, seed) | came_of_it(reward, success, is_over))
     if watch:
         watch(None, obs)

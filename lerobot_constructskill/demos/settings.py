@@ -7,11 +7,12 @@ from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
+from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.video import VIDEOS
 
-LABELS = ("clean", "executed")
+LABELS = ("clean", "executed", "advice")
 
 Share = Annotated[float, Range(0, 10_000)]
 
@@ -34,7 +35,8 @@ class GenerateConfig:
         max_failures: failed attempts, as a fraction of `episodes`, above which the run gives up.
         seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
         light_robot: draw the robot with decimated meshes, as in the environment.
-        labels: what `action` holds: the expert's `clean` command (the paper), or what was `executed` (MimicGen).
+        labels: what `action` holds: the expert's `clean` command (the paper), what was `executed` (MimicGen), or the
+            expert's `advice` from the state alone, which labels DAgger's rounds.
         video: how frames are kept: `av1` (2 KB each, with a loss that fine features show) or `lossless` (HEVC, up to
             30 KB: every pixel as it was rendered; few browsers play it).
         stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
@@ -87,7 +89,12 @@ def frames_digest(config: GenerateConfig) -> str:
     facts = generator_facts(config)
     for name in ("repo_id", "episodes", "max_failures", "seed_start"):
         del facts[name]
-    return digest(facts | {"versions": frame_versions()})
+    return digest(facts | advice_facts(config) | {"versions": frame_versions()})
+
+
+def advice_facts(config: GenerateConfig) -> dict[str, Any]:
+    """Which advice its labels are, where they are advice."""
+    return {"advice": REVISION} if config.labels == "advice" else {}
 
 
 def frame_versions() -> dict[str, str]:

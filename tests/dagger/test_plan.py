@@ -64,6 +64,13 @@ def test_another_way_to_drive_shares_the_policy_of_the_demonstrations_alone(fiel
     assert first == same and not {*others, *rounds} & {*before, *driven}
 
 
+@pytest.mark.parametrize("labels, taken", [("clean", True), ("advice", True), ("executed", False)])
+def test_all_labels_are_the_experts(labels, taken):
+    plan = Plan(replace(CONFIG, base=f"{SEEN} --labels={labels}"))
+    with nullcontext() if taken else pytest.raises(InputError, match="DAgger needs the expert's"):
+        assert (plan.round(1).digest == made()[1][0]) is (labels == "clean")
+
+
 def test_a_later_beta_changes_the_later_rounds_alone():
     assert made(betas=[0.0, 0.5])[1][0] == made()[1][0]
     assert made(betas=[0.0, 0.5])[1][1] != made()[1][1]

@@ -129,6 +129,11 @@ CORRUPTIONS = {
         "-0.3 m in y for a metre",
     ),
     "labels with noise": (rows(lambda t: t.assign(action=t["dart.executed_action"])), "Noise", "clean action"),
+    "labels that are no advice": (
+        metadata(SIDECAR, lambda facts: facts["generator"].update(labels="advice")),
+        "Noise",
+        "advice action",
+    ),
     "noise of another size": (
         metadata(SIDECAR, lambda facts: facts["generator"]["noise"].update(sigma=0.005)),
         "Noise",

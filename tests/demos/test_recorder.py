@@ -18,7 +18,7 @@ from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.replay import ReplayResult, replay
 from lerobot_constructskill.demos.columns import SIDECAR, demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase, make_expert
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.demos.shards import write_episode
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -97,7 +97,7 @@ def test_the_simulators_data_set_passes_every_check(recorded):
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
 
 
-def test_labels_are_what_was_executed_where_that_is_asked_for():
+def test_labels_are_what_was_executed_or_is_advised_where_that_is_asked_for():
     config = GenerateConfig("local/set", labels="executed")
     env = ConstructSkillEnv("brick_to_bin", episode_length=30)
     expert = make_expert(TASKS["brick_to_bin"], config.expert)
@@ -105,8 +105,13 @@ def test_labels_are_what_was_executed_where_that_is_asked_for():
     env.close()
     executed, _ = demonstrate(env, expert, config.noise, 0, config.labels)
     env.close()
-    for one, other in zip(clean, executed, strict=True):
+    advised, _ = demonstrate(env, expert, config.noise, 0, "advice")
+    env.close()
+    for one, other, third in zip(clean, executed, advised, strict=True):
         np.testing.assert_array_equal(other["action"], one["dart.executed_action"])
+        state = PrivilegedState(**{name: third[f"sim.{name}"] for name in SIM_STATE})
+        np.testing.assert_array_equal(third["action"], expert.advise(state).action)
+        np.testing.assert_array_equal(third["dart.executed_action"], one["dart.executed_action"])
         np.testing.assert_array_equal(other["dart.executed_action"], one["dart.executed_action"])
         assert (one["action"][:3] != one["dart.executed_action"][:3]).all()
 
