@@ -107,7 +107,8 @@ class Plan:
             "environment": self.env,
             "patience": self.config.patience,
         }
-        return Artifact("rounds", facts | {"versions": self._versions})
+        takeover = {} if self.config.takeover is None else {"takeover": self.config.takeover}
+        return Artifact("rounds", facts | takeover | {"versions": self._versions})
 
     def evaluation(self, number: int) -> Artifact:
         """How policy `number` does by itself."""
