@@ -36,7 +36,7 @@ class Plan:
 
     @cached_property
     def base(self) -> GenerateConfig:
-        flags = ["--repo_id=local/any", f"--workers={self.config.workers}"]
+        flags = ["--repo_id=local/any", f"--workers={self.config.workers}", "--labels=advice"]
         base = parse_named(GenerateConfig, "generate", self.config.base, flags)
         if base.labels == "executed":
             raise InputError(

@@ -25,6 +25,7 @@ class DaggerConfig:
         root: folder to write: `dataset`, `checkpoint` and `rounds.json`; `outputs/dagger/<name>` by default.
         store: folder of everything that is made on the way, each thing once for all commands.
         base: the demonstrations to begin with: a name or file that `constructskill-generate` takes, and flags over it.
+            Its labels are advice like those of the rounds; `--labels=clean` leaves those that know the past.
         training: how the policy is trained; each time from the start.
         seed: training seed.
         rounds: how often the policy drives; with 0 it is behaviour cloning.

@@ -129,9 +129,10 @@ class Study:
         return {name: v for name, v in self.variants.items() if setting in (v.settings or self.settings)}
 
     def data_for(self, setting: str, variant: Variant) -> str:
-        """The demonstrations that a variant is trained on in a setting."""
+        """The demonstrations that a variant is trained on in a setting; for DAgger they are labelled as its rounds."""
         own, other = self.settings[setting].data, variant.data or ""
-        return f"{own} {other}".strip() if other.startswith("--") else other or own
+        data = f"{own} {other}".strip() if other.startswith("--") else other or own
+        return f"{data} --labels=advice" if variant.dagger and "--labels" not in data else data
 
     def data_of(self, setting: str) -> list[str]:
         """All demonstrations that the setting's variants are trained on, its own first.

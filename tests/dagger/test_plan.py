@@ -67,10 +67,11 @@ def test_another_way_to_drive_shares_the_policy_of_the_demonstrations_alone(fiel
 
 
 @pytest.mark.parametrize("labels, taken", [("clean", True), ("advice", True), ("executed", False)])
-def test_all_labels_are_the_experts(labels, taken):
+def test_all_labels_are_the_experts_and_advice_if_nothing_else_is_asked_for(labels, taken):
+    assert Plan(replace(CONFIG, base="fast_executed_labels")).base.labels == "advice"
     plan = Plan(replace(CONFIG, base=f"{SEEN} --labels={labels}"))
     with nullcontext() if taken else pytest.raises(InputError, match="DAgger needs the expert's"):
-        assert (plan.round(1).digest == made()[1][0]) is (labels == "clean")
+        assert (plan.round(1).digest == made()[1][0]) is (labels == "advice")
 
 
 def test_a_later_beta_changes_the_later_rounds_alone():
@@ -99,11 +100,6 @@ def test_what_a_policy_reads_the_base_has_to_show(policy, reads):
             drives()
 
 
-def test_labels_that_are_not_the_experts_are_refused():
-    with pytest.raises(InputError, match="executed"):
-        _ = Plan(replace(CONFIG, base="fast_executed_labels")).base
-
-
 @pytest.mark.parametrize("name", names("dagger"))
 def test_every_shipped_configuration_makes_a_plan(name):
     plan = Plan(parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", name)))
@@ -111,7 +107,8 @@ def test_every_shipped_configuration_makes_a_plan(name):
 
 
 def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives():
-    variants = {"driven": Variant(FROZEN_VIT, seeds=2, dagger="smoke"), "cloned": Variant(FROZEN_VIT, seeds=1)}
+    cloned = Variant(FROZEN_VIT, seeds=1, data="--labels=advice")
+    variants = {"driven": Variant(FROZEN_VIT, seeds=2, dagger="smoke"), "cloned": cloned}
     study = Study("x", {"fixed": Setting("smoke")}, variants, training=Training(epochs=3))
     first, second, cloned = list_runs(study)
     config = parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", "smoke"))
@@ -126,4 +123,5 @@ def test_a_studys_rounds_begin_with_the_variants_own_demonstrations():
     driven = Variant(ACT, seeds=1, data="--episodes=1", dagger="smoke --rounds=2")
     (run,) = list_runs(Study("x", {"fixed": Setting("fast", {"obs_type": "pixels_agent_pos"})}, {"driven": driven}))
     assert (run.dagger.base.episodes, run.dagger.base.noise.sigma, run.dagger.config.rounds) == (1, 0.01, 2)
-    assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1"
+    assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1 --labels=advice"
+    assert run.arm.demonstrations.config.labels == run.dagger.base.labels == "advice"
