@@ -37,7 +37,6 @@ NOT_RUN = {
     "constructskill-submit": "of that evaluation",
     "constructskill-verify": "of that submission",
     "constructskill-dagger": "trains between rounds: tests/dagger/test_dagger.py runs it whole and small",
-    "constructskill-study dagger_quick": "twenty minutes a seed",
     "constructskill-check --root=outputs/driven": "of its set",
     "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
     "constructskill-generate outputs/dart_1.yaml": "no demonstration succeeds under the noise of a policy that was "
