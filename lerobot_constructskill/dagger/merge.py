@@ -88,7 +88,6 @@ def _provenance(plan: Plan, number: int, store: Store) -> dict[str, Any]:
         "checkpoint": plan.checkpoint(number - 1).digest,
         "seed_start": plan.seeds(number).start,
         "patience": plan.config.patience,
-        "takeover": plan.config.takeover,
         "advice": REVISION,
         **totals(outcomes),
     }

@@ -107,8 +107,7 @@ class Plan:
             "environment": self.env,
             "patience": self.config.patience,
         }
-        takeover = {} if self.config.takeover is None else {"takeover": self.config.takeover}
-        return Artifact("rounds", facts | takeover | {"versions": self._versions})
+        return Artifact("rounds", facts | {"versions": self._versions})
 
     def evaluation(self, number: int) -> Artifact:
         """How policy `number` does by itself."""

@@ -85,7 +85,7 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
     finished = {outcome.seed for outcome in whole(shards, OUTCOME, _read_one)}
     seeds = [seed for seed in plan.seeds(number) if seed not in finished]
     features = dagger_features(plan.task, plan.base.obs_type)
-    drive = Drive(number, plan.config.beta(number), plan.config.patience, plan.config.takeover)
+    drive = Drive(number, plan.config.beta(number), plan.config.patience)
     for episode in _drive(plan, number - 1, seeds, drive, store):
         with staged(shards / str(episode.seed)) as shard, room_for(folder):
             shard.mkdir()

@@ -33,9 +33,6 @@ class DaggerConfig:
         max_steps: steps after which an episode ends without success; the task's horizon by default.
         betas: for each round the probability that a step executes the expert's action and not the policy's; the
             last one is also for the rounds that follow. The label is the expert's in every step.
-        takeover: latest step at which the expert takes the wheel for the rest of an episode; each episode's own is
-            drawn from its seed. By default it never does. Rolling in like this is AggreVaTe's (Ross and Bagnell
-            2014); a chunk's later labels are those of the frames that follow, and here the expert made them follow.
         seed_start: seed of the first episode; the seeds count up through all rounds.
         patience: number of steps in a row, in which the expert knows no way to success, after which an episode ends.
         eval_episodes: number of episodes in which every policy is also evaluated, the same for all.
@@ -58,7 +55,6 @@ class DaggerConfig:
     episodes: Count = 16
     max_steps: Steps | None = None
     betas: Annotated[list[Beta], NotEmpty()] = field(default_factory=lambda: [0.0])
-    takeover: Steps | None = None
     seed_start: Seed = ROUND_SEED_START
     patience: Steps = 20
     eval_episodes: Annotated[int, Range(0, 100_000)] = 0

@@ -25,14 +25,12 @@ class Drive:
         number: the round's, for its frames.
         beta: probability of the expert's action in a step.
         patience: hopeless steps in a row after which an episode ends; they are dropped.
-        takeover: latest step from which on the expert acts; each episode draws its own. None: it never takes over.
         pictures: whether frames keep what the cameras saw, a megabyte every three steps.
     """
 
     number: int
     beta: float
     patience: int
-    takeover: int | None = None
     pictures: bool = True
 
 
@@ -43,14 +41,13 @@ class Episode:
     seed: int
     now: Step
     rng: np.random.Generator
-    takeover: float
     frames: list[dict[str, Any]] = field(default_factory=list)
     placed: bool = False
     hopeless: int = 0
 
     def choose(self, advice: Advice, proposed: np.ndarray, drive: Drive) -> np.ndarray:
         """The action of this step; the frame that it makes is kept with its label."""
-        expert = self.rng.random() < drive.beta or len(self.frames) >= self.takeover
+        expert = self.rng.random() < drive.beta
         executed = advice.action if expert else as_executed(proposed)
         self.hopeless = self.hopeless + 1 if advice.hopeless else 0
         self.frames.append(
@@ -108,7 +105,7 @@ def drive_all(
         lockstep, running = Lockstep(agents), {}
         while seeds or running:
             free = [lane for lane in range(len(agents)) if lane not in running][: len(seeds)]
-            running |= _start({lane: seeds.pop(0) for lane in free}, agents, sims, drive)
+            running |= _start({lane: seeds.pop(0) for lane in free}, agents, sims)
             observations = {lane: Observation(e.now.seen, e.now.sim, instruction) for lane, e in running.items()}
             proposed = _unwrap(lockstep.act(observations))
             advice = {lane: expert.advise(PrivilegedState(**e.now.sim)) for lane, e in running.items()}
@@ -128,15 +125,11 @@ def copies(learner: Agent, count: int) -> list[Agent]:
     return [PolicyAgent(policy, learner.preprocessor, learner.postprocessor) for policy in policies]
 
 
-def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators, drive: Drive) -> dict[int, Episode]:
+def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, Episode]:
     for lane, seed in seeds.items():
         agents[lane].reset(seed)
-    steps, running = _unwrap(sims.reset(seeds)), {}
-    for lane, seed in seeds.items():
-        rng = np.random.default_rng([seed, 1])
-        takeover = np.inf if drive.takeover is None else rng.integers(drive.takeover + 1)
-        running[lane] = Episode(seed, steps[lane], rng, takeover)
-    return running
+    steps = _unwrap(sims.reset(seeds))
+    return {lane: Episode(seed, steps[lane], np.random.default_rng([seed, 1])) for lane, seed in seeds.items()}
 
 
 def _unwrap(results: Mapping[int, Any]) -> Mapping[int, Any]:

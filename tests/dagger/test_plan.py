@@ -57,9 +57,7 @@ def test_another_learner_is_another_run_from_the_start(fields):
     assert not {*sum(made(**fields), [])} & {*sum(made(), [])}
 
 
-@pytest.mark.parametrize(
-    "fields", [{"episodes": 5}, {"max_steps": 9}, {"patience": 3}, {"betas": [0.5]}, {"takeover": 9}]
-)
+@pytest.mark.parametrize("fields", [{"episodes": 5}, {"max_steps": 9}, {"patience": 3}, {"betas": [0.5]}])
 def test_another_way_to_drive_shares_the_policy_of_the_demonstrations_alone(fields):
     (first, *others), rounds = made(**fields)
     (same, *before), driven = made()

@@ -113,16 +113,6 @@ def test_an_evaluation_keeps_no_pictures_and_goes_the_same_way():
         np.testing.assert_array_equal(table(episode, "action"), table(with_pictures[seed], "action"))
 
 
-def test_the_expert_takes_over_at_a_step_of_each_episodes_own_and_places():
-    episodes = drive(0.0, takeover=30)
-    first = [[f["dagger.actor"] for f in episode.frames].index(EXPERT) for episode in episodes.values()]
-    assert max(first) <= 30 and len(set(first)) > 1
-    for step, episode in zip(first, episodes.values(), strict=True):
-        assert {frame["dagger.actor"] for frame in episode.frames[step:]} == {EXPERT}
-        assert {frame["dagger.actor"] for frame in episode.frames[:step]} <= {LEARNER}
-    assert all(episode.placed for episode in episodes.values())
-
-
 class Despairing:
     """Knows no way from a height on."""
 
