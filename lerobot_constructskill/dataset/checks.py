@@ -120,7 +120,8 @@ def check_noise(data: DataSet) -> Iterator[str]:
     experts = data.rounds == 0
     wanted = (executed if config.labels == "executed" else clean).copy()
     if config.labels == "advice":
-        wanted[experts] = _advice(data, experts)
+        for row, advised in _advice(data, np.flatnonzero(experts)):
+            wanted[row] = advised
     off = np.abs(data.column("action") - wanted)
     if off[experts].max(initial=0) > 1e-6 or off[:, :3].max() > 1e-6:
         yield f"action is not the {config.labels} action that the provenance says its labels are."
@@ -139,12 +140,13 @@ def check_noise(data: DataSet) -> Iterator[str]:
             yield f"The noise in {phase} (std {spread} mm) is not what the {model} model draws from the seed."
 
 
-def _advice(data: DataSet, rows: np.ndarray) -> np.ndarray:
-    """What the expert advises in some frames, (n, action)."""
+def _advice(data: DataSet, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """What the expert advises in some frames."""
     expert = make_expert(get_task(data.config.task), data.config.expert)
-    known = {name: data.column(f"sim.{name}")[rows].reshape(rows.sum(), -1) for name in SIM_STATE}
-    states = (PrivilegedState(**{name: values[row] for name, values in known.items()}) for row in range(rows.sum()))
-    return np.stack([expert.advise(state).action for state in states])
+    known = {name: data.column(f"sim.{name}") for name in SIM_STATE}
+    for row in rows:
+        state = PrivilegedState(**{name: np.atleast_1d(values[row]) for name, values in known.items()})
+        yield row, expert.advise(state).action
 
 
 def check_episodes(data: DataSet) -> Iterator[str]:

@@ -86,8 +86,8 @@ def advise(task) -> tuple[Expert, list[tuple[PrivilegedState, Advice]]]:
 
 
 def total(pairs) -> list[float]:
-    """The sum of all actions: other advice in one of the states is another sum."""
-    return sum(advice.action.astype(float) for _, advice in pairs).round(6).tolist()
+    """The sum of all actions, and how often nothing helps: other advice in one of the states is another sum."""
+    return sum(np.array([*advice.action, advice.hopeless], float) for _, advice in pairs).round(6).tolist()
 
 
 @pytest.fixture(scope="module", params=TASKS)
