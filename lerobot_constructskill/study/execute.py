@@ -1,4 +1,4 @@
-"""One piece of a study: some seeds of one arm, trained together, evaluated in lockstep, each kept as a run's folder.
+"""One piece of a study: some seeds of a variant, trained together, evaluated in lockstep, each kept as a run's folder.
 
 <store>/runs/<digest>/  spec.json  checkpoint (a link)  episodes.parquet  recordings.parquet (what was executed)
                         video.mp4 (of seed 0)  log.txt (if it failed)
@@ -10,6 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
@@ -27,7 +28,7 @@ from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
-from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
+from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.training.trainers import NO_MEMORY, trainer_of
@@ -42,10 +43,10 @@ OF_THE_MACHINE = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, EN
 
 @dataclass(frozen=True)
 class Job:
-    """Runs of one arm that are made in one pass.
+    """Runs of one variant in one setting that are made in one pass.
 
     Args:
-        runs: they differ in their seeds alone.
+        runs: they differ in their seeds and, where each seed has demonstrations of its own, in their arms.
         store: where everything is made.
         times: folder in which is noted what took how long.
         workers: processes that generate demonstrations.
@@ -55,10 +56,6 @@ class Job:
     store: Store
     times: Path
     workers: int = 1
-
-    @property
-    def arm(self) -> Arm:
-        return self.runs[0].arm
 
 
 def make_runs(job: Job) -> Iterator[Run]:
@@ -84,20 +81,23 @@ def obtain(job: Job, demonstrations: Demonstrations) -> LeRobotDataset:
 
 def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
     """Train those of `runs` that have no checkpoint yet, and return why some seeds could not be trained."""
-    arm = job.arm
-    if arm.policy is None or not runs:
-        return {}
-    trainer, failed = trainer_of(arm.policy), {}
-    with job.store.claim([run.checkpoint for run in runs]) as claimed:
-        missing = [run for run in runs if run.checkpoint in claimed]
-        at_once = trainer.seeds_together(arm.policy) and not arm.dagger  # each seed drives its own rounds
-        for some in [missing] if at_once and missing else [[run] for run in missing]:
+    failed = {}
+    with job.store.claim([run.checkpoint for run in runs if run.checkpoint]) as claimed:
+        for some in _together([run for run in runs if run.checkpoint in claimed]):
             try:
                 _fit(job, some)
             except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
                 _let_through(error)
                 failed |= {run.seed: error for run in some if not job.store.has(run.checkpoint)}
     return failed
+
+
+def _together(runs: Sequence[Run]) -> Iterator[list[Run]]:
+    """Runs that are trained at once: those of one arm, if its trainer can and no seed drives rounds of its own."""
+    for arm, group in groupby(runs, key=lambda run: run.arm):
+        seeds = list(group)
+        at_once = trainer_of(arm.policy).seeds_together(arm.policy) and not arm.dagger
+        yield from [seeds] if at_once else ([run] for run in seeds)
 
 
 def _let_through(error: Exception) -> None:
@@ -117,7 +117,8 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def _fit(job: Job, runs: Sequence[Run]) -> None:
-    arm, training = job.arm, job.arm.training
+    arm = runs[0].arm
+    training = arm.training
     if arm.dagger:
         for run in runs:
             with timed(job.times, "rounds of DAgger"):
@@ -142,12 +143,13 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     if not ready:
         return
     runs, agents = zip(*ready, strict=True)
-    first, count = job.arm.evaluation["seed"], job.arm.evaluation["episodes"]
+    arm = runs[0].arm  # in the environment and in how it is evaluated, one is like the other
+    first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
     filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
     film = FirstEpisode(next(iter(filmed), None))
     with timed(job.times, "evaluation"):
         starts = range(first, first + count)
-        for number, rollout in roll_out(agents, job.arm.env, starts, on_step=film.add, filmed=filmed):
+        for number, rollout in roll_out(agents, arm.env, starts, on_step=film.add, filmed=filmed):
             if rollout.error is not None:
                 _let_through(rollout.error)
                 yield _write_failed(job, runs[number], rollout.error)
@@ -156,7 +158,7 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
 
 
 def _agent(job: Job, run: Run) -> Agent:
-    arm = job.arm
+    arm = run.arm
     if arm.policy is not None:
         config = arm.policy
         here = {name: getattr(config, name) for name in trainer_of(config).places}  # a path may differ by now
@@ -168,7 +170,7 @@ def _agent(job: Job, run: Run) -> Agent:
 def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     row = _row(job, run, rollout.backend)
     rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
-    start = {name: job.arm.env[name] for name in STARTING}
+    start = {name: run.arm.env[name] for name in STARTING}
     told = {"backend": rollout.backend, **start}
     pairs = zip(rollout.episodes, rollout.actions, strict=True)
     return _write(job, run, rows, write_video, [Recording.of(episode, actions, **told) for episode, actions in pairs])
@@ -201,7 +203,7 @@ def _write(
 
 def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
     """What every row of a run says."""
-    arm, weights, made_of = job.arm, None, {}
+    arm, weights, made_of = run.arm, None, {}
     if run.checkpoint and job.store.has(run.checkpoint):
         checkpoint = job.store.folder(run.checkpoint)
         model = checkpoint / "model.safetensors"
@@ -221,7 +223,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
 
 
 def _dataset_sha256(job: Job, run: Run) -> str | None:
-    made = job.arm.demonstrations and job.arm.demonstrations.artifact
+    made = run.arm.demonstrations and run.arm.demonstrations.artifact
     if run.dagger:
-        made = run.dagger.data(job.arm.dagger.rounds)
+        made = run.dagger.data(run.arm.dagger.rounds)
     return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

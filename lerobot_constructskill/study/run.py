@@ -87,7 +87,7 @@ def choose(runs: Sequence[Run], only: str) -> list[Run]:
 
 def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
     different = {run.artifact.digest: run for run in missing}.values()  # two names may be of one thing
-    for _, seeds in groupby(different, key=lambda run: id(run.arm)):
+    for _, seeds in groupby(different, key=lambda run: (run.arm.setting, run.arm.name)):
         for some in batched(seeds, options.together):  # noqa: B911  the last one may be shorter
             yield Job(some, store, root, options.workers)
 

@@ -17,7 +17,7 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
-from lerobot_constructskill.study.execute import EPISODES, _let_through
+from lerobot_constructskill.study.execute import EPISODES, _let_through, _together
 from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
@@ -138,6 +138,23 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
     list_runs(study(variants=often))
     with pytest.raises(InputError, match=r"variants\.driven\.dagger: .* not 2,001"):
         list_runs(study(variants=often, demonstrations="own"))
+
+
+@pytest.mark.parametrize(("demonstrations", "at_once"), [("shared", [3]), ("own", [1, 1, 1])])
+def test_a_variants_seeds_are_evaluated_in_one_pass_and_trained_in_one_if_their_data_are_the_same(
+    demonstrations, at_once, tmp_path, monkeypatch
+):
+    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    variants = {"a": Variant(policy, seeds=3), "driven": Variant(policy, seeds=3, dagger="smoke")}
+    jobs = []
+    monkeypatch.setattr("lerobot_constructskill.study.run.make_runs", lambda job: jobs.append(job) or job.runs)
+    monkeypatch.setattr("lerobot_constructskill.study.run.validate", lambda *_: None)
+    one = study(variants=variants, references={}, demonstrations=demonstrations)
+    run_study(one, "", tmp_path / "x", Store(tmp_path / "store"), Options())
+    together = [[run.id for run in job.runs] for job in jobs]
+    assert together == [[f"fixed/{name}/seed_{seed}" for seed in range(3)] for name in variants]
+    trained = [[len(runs) for runs in _together(job.runs)] for job in jobs]
+    assert trained == [at_once, [1, 1, 1]], "each seed drives rounds of its own"
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
