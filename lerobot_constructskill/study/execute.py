@@ -43,10 +43,10 @@ OF_THE_MACHINE = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, EN
 
 @dataclass(frozen=True)
 class Job:
-    """Runs of one variant in one setting that are made in one pass.
+    """Runs of one variant or reference in one setting that are made in one pass.
 
     Args:
-        runs: they differ in their seeds and, where each seed has demonstrations of its own, in their arms.
+        runs: they differ in their seeds and, where each seed has demonstrations of its own, in these.
         store: where everything is made.
         times: folder in which is noted what took how long.
         workers: processes that generate demonstrations.
