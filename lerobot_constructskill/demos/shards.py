@@ -17,10 +17,16 @@ from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.progress import quiet
 
 OUTCOME = "attempt.json"
 EPISODE = "episode"
+
+LATE = (
+    "An episode's video was not ready within LeRobot's two minutes: the machine stood still, or has too much to do. "
+    "The same command goes on."
+)
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,11 @@ def write_episode(
         features: its columns, as `columns` lists them.
         frames: their values, in order.
         video: an entry of `VIDEOS`.
+
+    Raises:
+        MachineError: the machine stood still, and LeRobot did not wait for a video any longer.
     """
+    import av
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
@@ -118,5 +128,11 @@ def write_episode(
         )
         for frame in frames:
             dataset.add_frame(frame | {"task": task.instruction})
-        dataset.save_episode()
+        # After two minutes LeRobot takes what there is of a video: perhaps nothing, perhaps all but its statistics.
+        try:
+            dataset.save_episode()
+        except (av.InvalidDataError, FileNotFoundError):
+            raise MachineError(LATE) from None
+        if len(frames) > 1 and not {*dataset.meta.video_keys} <= {*dataset.meta.stats}:
+            raise MachineError(LATE)
         dataset.finalize()

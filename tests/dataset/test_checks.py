@@ -80,6 +80,13 @@ def frozen(pictures):
     return [pictures[40] if 40 <= index < 90 else picture for index, picture in enumerate(pictures)]
 
 
+def without_statistics(root):
+    path = root / "meta/episodes/chunk-000/file-000.parquet"
+    table = pd.read_parquet(path)
+    name = "stats/observation.images.base/mean"
+    table.assign(**{name: table[name].where(table["episode_index"] != 3)}).to_parquet(path)
+
+
 def repeated_episode(table):
     again = table[table.episode_index == 0].assign(episode_index=8)
     return pd.concat([table[table.episode_index != 8], again], ignore_index=True)
@@ -186,6 +193,7 @@ CORRUPTIONS = {
         "Statistics",
         "no q99 of action",
     ),
+    "a video that was given up": (without_statistics, "Statistics", "Episodes 3 have no statistics of .*base"),
     "a hidden failure": (metadata(SIDECAR, lambda f: f.update(discarded_seeds=[])), "Provenance", "the attempts"),
     "an unnamed version": (metadata(SIDECAR, lambda f: f["versions"].pop("sapien")), "Provenance", "sapien"),
     "no modality": (lambda root: (root / "meta/modality.json").unlink(), "Provenance", "modality.json"),

@@ -6,11 +6,13 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import _CameraEncoderThread
 
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, SIM_STATE, TASKS
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
@@ -22,6 +24,7 @@ from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedS
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.demos.shards import write_episode
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import MachineError
 
 pytestmark = pytest.mark.sim
 NEVER = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
@@ -148,6 +151,32 @@ def test_how_the_set_was_made_travels_with_it(recorded):
     np.testing.assert_allclose(facts["noise_covariance"], 1e-4 * np.eye(3))
     assert facts["generator"]["noise"]["sigma"] == 0.01 and facts["generator"]["light_robot"] in (True, False)
     assert facts["attempts"] == summary.episodes + len(summary.discarded_seeds)
+
+
+@pytest.mark.parametrize("in_the_end", [True, False])
+def test_a_video_that_lerobot_gives_up_is_an_error(tmp_path, monkeypatch, in_the_end):
+    """Its encoder stands still for longer than LeRobot waits, and then goes on at once, or too late."""
+    columns, go_on = demonstration_features(TASKS["brick_to_bin"], "pixels_agent_pos"), threading.Event()
+    features = {name: columns[name] for name in ("observation.images.base", "observation.images.wrist", "action")}
+    frame = {name: np.zeros(feature["shape"], np.float32) for name, feature in features.items()}
+    encode, join = _CameraEncoderThread.run, threading.Thread.join
+
+    def late(thread):
+        thread.frame_queue.maxsize = 0  # or the end of the episode would wait for room in it
+        go_on.wait()
+        encode(thread)
+
+    def impatient(thread, timeout):
+        first = timeout == 120
+        join(thread, 0.01 if first or not in_the_end else timeout)
+        if first and in_the_end:
+            go_on.set()
+
+    monkeypatch.setattr(_CameraEncoderThread, "run", late)
+    monkeypatch.setattr(_CameraEncoderThread, "join", impatient)
+    with pytest.raises(MachineError, match="The same command goes on"):
+        write_episode("local/e", TASKS["brick_to_bin"], features, [frame] * 3, tmp_path / "e", "av1")
+    go_on.set()
 
 
 def test_failed_attempts_are_discarded_and_end_a_hopeless_run(tmp_path):
