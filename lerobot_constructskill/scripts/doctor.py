@@ -3,8 +3,11 @@
 import shutil
 import subprocess
 import sys
+import sysconfig
 from collections.abc import Callable, Iterable
 from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
 
 from lerobot_constructskill.errors import DISTRIBUTION, plural
 from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
@@ -12,6 +15,7 @@ from lerobot_constructskill.scripts.doctor_checks import (
     Finding,
     Level,
     Probe,
+    judge_bytecode,
     judge_encoder,
     judge_fetched,
     judge_ffmpeg,
@@ -122,6 +126,12 @@ def has_gpu() -> bool:
     return subprocess.run(["nvidia-smi", "-L"], capture_output=True, check=False).returncode == 0
 
 
+def check_bytecode() -> Finding:
+    package = find_spec("lerobot")
+    compiled = package is None or package.cached is None or Path(package.cached).exists()
+    return judge_bytecode(not sys.dont_write_bytecode, compiled, sysconfig.get_path("purelib"))
+
+
 def check_versions() -> Finding:
     from packaging.utils import canonicalize_name
 
@@ -138,6 +148,7 @@ def check_vulkan() -> Finding:
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
     lambda: judge_python(sys.version_info[:2]),
+    check_bytecode,
     lambda: judge_name(list(installed_versions())),
     check_versions,
     lambda: judge_opencv(installed_versions()),

@@ -60,6 +60,14 @@ def judge_python(version: tuple[int, int]) -> Finding:
     return Finding(Level.OK, "Python", text)
 
 
+def judge_bytecode(kept: bool, compiled: bool, folder: str) -> Finding:
+    """Containers often forbid Python to keep what it compiles: a process then imports for twice as long."""
+    if kept or compiled:
+        return Finding(Level.OK, "Compiled packages", "kept" if kept else "there")
+    remedy = f"unset PYTHONDONTWRITEBYTECODE, or run: python -m compileall -q '{folder}'."
+    return Finding(Level.WARN, "Compiled packages", f"every process compiles LeRobot and torch anew; {remedy}")
+
+
 def judge_name(names: Sequence[str]) -> Finding:
     """LeRobot compares the raw `Name:`, so a build backend that writes hyphens hides the plugin."""
     if DISTRIBUTION in names:
