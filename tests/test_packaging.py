@@ -73,8 +73,9 @@ def test_plugin_registers_without_simulator_or_model() -> None:
 
 
 HELP = """
-import contextlib, importlib, io, sys
+import contextlib, importlib, io, os, sys
 sys.argv = ["{command}", "--help"]
+os.environ.pop("OMP_WAIT_POLICY", None)
 help = io.StringIO()
 try:
     with contextlib.redirect_stdout(help):
@@ -83,6 +84,7 @@ except SystemExit as exit:
     assert not exit.code, exit.code
 assert "usage: " in help.getvalue()
 assert "torch" not in sys.modules, "--help imports torch"
+assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE", "its threads will spin"
 """
 
 

@@ -60,6 +60,8 @@ def _tell_names(kind: str) -> str:
 @contextmanager
 def edge() -> Iterator[None]:
     """Turn what a command raises into one sentence and an exit status, and keep its traceback in a log."""
+    # Torch reads it when it is imported. Else its threads spin while they wait for one that another process holds up.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command, debug = list(sys.argv), DEBUG in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != DEBUG]
     logging.getLogger().addFilter(_is_news)
