@@ -131,8 +131,8 @@ def write_episode(
         # After two minutes LeRobot takes what there is of a video: perhaps nothing, perhaps all but its statistics.
         try:
             dataset.save_episode()
-        except (av.InvalidDataError, FileNotFoundError):
-            raise MachineError(LATE) from None
+        except (av.InvalidDataError, FileNotFoundError) as error:
+            raise MachineError(LATE) from error
         if len(frames) > 1 and not {*dataset.meta.video_keys} <= {*dataset.meta.stats}:
             raise MachineError(LATE)
         dataset.finalize()
