@@ -1,7 +1,7 @@
-"""Training steps/s of the precise recipe's heads while torch's threads sleep when they wait, as in our commands.
+"""Training steps/s of keypoints and a small head while torch's threads sleep when they wait, as in our commands.
 
 Against it: they spin, as OpenMP has them do by default. Each alone, and beside a busy process for every second core.
-They take turns, each in a process of its own. Maps are random.
+They take turns, each in a process of its own. Maps are random, of the size that keypoints.py takes.
 """
 
 import os
@@ -12,10 +12,13 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
 
+from keypoints import BATCH, DIM, PATCHES
 from measure import report
 
+from lerobot_constructskill.artifacts.pools import cores
+
 TURNS, SECONDS = 3, 8
-BATCH, PATCHES, DIM, HIDDEN, ACTIONS = 64, 784, 152, 256, 32
+HIDDEN, ACTIONS = 256, 32
 SLEEP, SPIN = {"OMP_WAIT_POLICY": "PASSIVE"}, {}
 BUSY = "while True: pass"
 
@@ -32,13 +35,18 @@ def steps_a_second() -> float:
     heads = nn.Sequential(nn.Linear(2 * readout.patterns.out_features, HIDDEN), nn.ReLU(), nn.Linear(HIDDEN, ACTIONS))
     optimizer = torch.optim.AdamW([*readout.parameters(), *heads.parameters()], lr=1e-3)
     patches, actions = torch.randn(BATCH, PATCHES, DIM), torch.randn(BATCH, ACTIONS)
-    steps, start = -1, 0.0
-    while steps < 0 or time.perf_counter() - start < SECONDS:
+
+    def step() -> None:
         loss = nn.functional.l1_loss(heads(readout(patches)), actions)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        steps, start = steps + 1, start or time.perf_counter()  # the first makes the threads
+
+    step()  # makes the threads
+    steps, start = 0, time.perf_counter()
+    while time.perf_counter() - start < SECONDS:
+        step()
+        steps += 1
     return steps / (time.perf_counter() - start)
 
 
@@ -54,8 +62,8 @@ def measure(policy: dict[str, str], neighbours: int) -> float:
 
 
 def main() -> None:
-    every_second = max(1, len(os.sched_getaffinity(0)) // 2)
-    for neighbours, where in ((0, "alone"), (every_second, f"beside {every_second} busy process")):
+    every_second = max(1, cores() // 2)
+    for neighbours, where in ((0, "alone"), (every_second, "beside a busy process for every second core")):
         turns = [(measure(SLEEP, neighbours), measure(SPIN, neighbours)) for _ in range(TURNS)]
         sleeping, spinning = (sum(rates) / TURNS for rates in zip(*turns, strict=True))
         what = f"training steps/s of keypoints and heads, {where}, threads sleep while they wait"

@@ -61,7 +61,7 @@ def judge_python(version: tuple[int, int]) -> Finding:
 
 
 def judge_bytecode(kept: bool, compiled: bool, folder: str) -> Finding:
-    """Containers often forbid Python to keep what it compiles: a process then imports for twice as long."""
+    """Containers often forbid Python to keep what it compiles, and then every process waits for it again."""
     if kept or compiled:
         return Finding(Level.OK, "Compiled packages", "kept" if kept else "there")
     remedy = f"unset PYTHONDONTWRITEBYTECODE, or run: python -m compileall -q '{folder}'."
