@@ -8,18 +8,23 @@ from pathlib import Path
 from lerobot_constructskill.contract import DEMO_SEED_START
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.demos.shards import attempt
+from lerobot_constructskill.demos.shards import Attempt, attempt
 
 
-def main(folder: Path, count: int) -> None:
+def copies(shards: Path, count: int) -> tuple[GenerateConfig, list[Attempt]]:
+    """Make one demonstration and put as many shards of it into a folder; return what `merge` takes beside them."""
     config = GenerateConfig("local/merged", episodes=count)
-    shards = folder / "shards"
     shards.mkdir(parents=True)
     first = attempt(config, DEMO_SEED_START, shards)
     attempts = [replace(first, seed=first.seed + number) for number in range(count)]
     for copy in attempts[1:]:
         shutil.copytree(shards / str(first.seed), shards / str(copy.seed))
-    merge(config, attempts, shards, folder / "set")
+    return config, attempts
+
+
+def main(folder: Path, count: int) -> None:
+    shards = folder / "shards"
+    merge(*copies(shards, count), shards, folder / "set")
 
 
 if __name__ == "__main__":

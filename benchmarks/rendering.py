@@ -11,24 +11,17 @@ PyTorch gets one thread: the simulator's tensors are tiny, and waking a second o
 import os
 import subprocess
 import sys
-import time
 
 import gymnasium as gym
 import numpy as np
 import torch
-from measure import Timer, report
+from measure import CpuTimer, Timer, report
 
 from lerobot_constructskill.contract import IMAGE_SIZE
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 BLOCKS, STEPS = 6, 20
-
-
-class CpuTimer(Timer):
-    """Adds up the seconds that all threads of this process together computed in its `with` blocks."""
-
-    clock = staticmethod(time.process_time)
 
 
 def pick_cube():

@@ -5,12 +5,17 @@ else comes from LeRobot's packages by the names in their `__all__`: `from lerobo
 tests/test_lerobot_internals.py holds both rules, and says in a sentence each what a new LeRobot has changed.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot_constructskill.errors import MachineError
+
+if TYPE_CHECKING:
+    from datasets import Dataset
 
 NAMES = {
     # Vector environments that stand still after an episode's end, as LeRobot's own benchmarks make them.
@@ -19,6 +24,7 @@ NAMES = {
     # Statistics and files of data sets, read and written as LeRobot does it.
     "compute_episode_stats": "lerobot.datasets.compute_stats",
     "decode_video_frames": "lerobot.datasets.video_utils",
+    "load_episodes": "lerobot.datasets.dataset_metadata",
     "load_info": "lerobot.datasets.io_utils",
     "load_stats": "lerobot.datasets.io_utils",
     "write_video": "lerobot.utils.io_utils",
@@ -65,3 +71,27 @@ def _with_parents(module: str) -> list[str]:
 def largest_rewards(eval_info: dict[str, Any]) -> list[float]:
     """The largest reward of every episode in an `eval_info.json` of `lerobot-eval`, over all tasks."""
     return [reward for task in eval_info["per_task"] for reward in task["metrics"]["max_rewards"]]
+
+
+@contextmanager
+def episodes_without_statistics() -> Iterator[None]:
+    """In its block LeRobot opens a data set without those columns of its episodes that it reads and then drops.
+
+    They are the statistics, nine of ten columns, and `datasets` takes time with the square of the number. Nothing goes
+    to its cache either.
+    """
+    theirs, owner = __getattr__("load_episodes"), import_module(NAMES["load_episodes"])
+    owner.load_episodes = _kept_of_episodes
+    try:
+        yield
+    finally:
+        owner.load_episodes = theirs
+
+
+def _kept_of_episodes(folder: Path) -> "Dataset":
+    from datasets import Dataset
+    from pyarrow.dataset import dataset
+
+    episodes = dataset(sorted(map(str, (folder / "meta" / "episodes").glob("*/*.parquet"))))
+    kept = [name for name in episodes.schema.names if not name.startswith("stats/")]
+    return Dataset(episodes.to_table(columns=kept).replace_schema_metadata())

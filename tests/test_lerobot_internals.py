@@ -46,6 +46,7 @@ CALLS = {
     "freeze_after_episode_end": (("env_fn",), {}),
     "compute_episode_stats": (("columns", "features"), {}),
     "decode_video_frames": (("path", "times", "tolerance"), {"return_uint8": True}),
+    "load_episodes": (("folder",), {}),
     "load_info": (("folder",), {}),
     "load_stats": (("folder",), {}),
     "write_video": (("path", "frames", "fps"), {}),

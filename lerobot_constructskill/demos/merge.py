@@ -59,13 +59,16 @@ def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> N
     """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
     from lerobot.datasets import aggregate_datasets
 
-    while len(roots) > GROUP:
-        groups = list(batched(roots, GROUP))
-        scratch = scratch / "groups"
-        roots = [scratch / str(number) for number in range(len(groups))]
-        for group, root in zip(groups, roots, strict=True):
-            aggregate_datasets([repo_id] * len(group), repo_id, list(group), root)
-    aggregate_datasets([repo_id] * len(roots), repo_id, roots, folder)
+    from lerobot_constructskill.lerobot_internals import episodes_without_statistics
+
+    with episodes_without_statistics():  # it opens each of them
+        while len(roots) > GROUP:
+            groups = list(batched(roots, GROUP))
+            scratch = scratch / "groups"
+            roots = [scratch / str(number) for number in range(len(groups))]
+            for group, root in zip(groups, roots, strict=True):
+                aggregate_datasets([repo_id] * len(group), repo_id, list(group), root)
+        aggregate_datasets([repo_id] * len(roots), repo_id, roots, folder)
 
 
 def write_statistics(folder: Path) -> None:

@@ -1,11 +1,36 @@
-"""Merging in groups of groups, which keeps the cost of many demonstrations linear, changes no frame."""
+"""What makes the merging of many demonstrations fast changes nothing."""
+
+from contextlib import nullcontext
 
 import pytest
 import torch
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from toy import record_toy
 
+from lerobot_constructskill import lerobot_internals
 from lerobot_constructskill.demos import merge
+from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.lerobot_internals import episodes_without_statistics
+
+
+@pytest.fixture
+def lerobots_way(monkeypatch):
+    """LeRobot reads all that there is of the episodes that it merges."""
+    monkeypatch.setattr(lerobot_internals, "episodes_without_statistics", nullcontext)
+
+
+def test_what_lerobot_keeps_of_episodes_is_what_it_is_given(pristine):
+    theirs = LeRobotDatasetMetadata("local/toy", root=pristine)
+    with episodes_without_statistics():
+        ours = LeRobotDatasetMetadata("local/toy", root=pristine)
+    assert ours.episodes.column_names == theirs.episodes.column_names
+    assert ours.episodes.features == theirs.episodes.features and ours.episodes[:] == theirs.episodes[:]
+
+
+@pytest.mark.slow
+def test_a_set_is_the_same_file_for_file_as_lerobot_merges_it(pristine, tmp_path, lerobots_way):
+    record_toy(tmp_path / "plain", episodes=9)
+    assert file_hashes(tmp_path / "plain") == file_hashes(pristine)
 
 
 @pytest.mark.slow
