@@ -1,4 +1,4 @@
-"""The order of the tests, their garbage, and the browser that some of them look through."""
+"""The order of the tests, their garbage, what encodes in some, and the browser that others look through."""
 
 import gc
 import shutil
@@ -20,6 +20,16 @@ def pytest_collection_finish() -> None:
     """What the tests import stays: the collector need not look at LeRobot's million objects again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="module")
+def by_pytorch():
+    """PyTorch encodes: OpenVINO compiles each policy's backbone for three seconds. test_backbones.py compares them."""
+    from lerobot_constructskill.policies.frozen_vit import openvino
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(openvino, "is_installed", lambda: False)
+        yield
 
 
 def find_chromium() -> str | None:

@@ -75,7 +75,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
     return LeRobotDataset("local/random", root=root)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def config(tiny_weights: Path):
     """Make a configuration on the tiny backbone; keywords are fields."""
 

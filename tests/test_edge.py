@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 import pytest
+from draccus.wrappers import docstring
 
 from lerobot_constructskill import parsing
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
@@ -37,6 +38,14 @@ NEEDED = {
 
 BAD = ["nan", "inf", "-1", "0", "0.5", "1000000000", "", "[1]", "[]", "[nan]", "{a: 1}", "null", "true", ".", "../x"]
 BAD += ["é名\u0301", "a\\nb", "x" * 5000, "!!python/x 1"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def helps_are_read_once():
+    """draccus looks for the help of each field in the source, for every command line: most of the time here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(docstring, "get_attribute_docstring", cache(docstring.get_attribute_docstring))
+        yield
 
 
 @cache

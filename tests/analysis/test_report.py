@@ -74,6 +74,7 @@ def test_page_holds_the_papers_tables_and_every_figure(study):
     assert (study / "study.yaml").read_text() in "".join(reader.text)
 
 
+@pytest.mark.slow
 def test_every_variant_is_validated_on_every_set_of_the_setting(study):
     markdown = (study / "report.md").read_text()
     fixed, moved = (part for part in markdown.split("Error on what is held out of each set")[1:])
@@ -85,6 +86,7 @@ def test_every_variant_is_validated_on_every_set_of_the_setting(study):
     assert "fast_noise_free" in (study / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_page_is_one_file_without_script(study):
     reader = Reader((study / "report.html").read_text())
     assert "script" not in reader.tags and "table" in reader.tags
@@ -93,6 +95,7 @@ def test_page_is_one_file_without_script(study):
     assert reader.tags.count("video") == 1
 
 
+@pytest.mark.slow
 def test_everything_is_escaped(study):
     page, markdown = (study / "report.html").read_text(), (study / "report.md").read_text()
     assert HOSTILE in " ".join(Reader(page).text).replace("  ", " ")
@@ -102,6 +105,7 @@ def test_everything_is_escaped(study):
     assert "\\*żółć\\*" in line and "煉瓦" in line
 
 
+@pytest.mark.slow
 def test_report_says_what_is_missing_and_what_failed(study):
     markdown = (study / "report.md").read_text()
     assert "1 of 82 runs is missing" in markdown

@@ -137,6 +137,7 @@ def test_power_grows_with_seeds_and_difference():
     assert over_seeds == sorted(over_seeds) and over_rates == sorted(over_rates)
 
 
+@pytest.mark.slow
 def test_what_can_be_detected_is_detected():
     assert detectable_difference(1.0, 3) is None
     drops = [detectable_difference(1.0, seeds) for seeds in (10, 20, 40)]
@@ -233,6 +234,7 @@ def test_a_better_variant_with_a_lower_error_is_no_order_within_variants(rng):
     assert abs(within.tau.value) < 0.4 and within.p_value > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("successes", [1, 3])
 def test_kendalls_p_value_keeps_its_level_where_few_succeed(successes, rng):
     p_values = []

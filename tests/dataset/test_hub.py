@@ -17,6 +17,8 @@ from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.errors import TakenError
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
 
+pytestmark = pytest.mark.slow
+
 TOKEN = next(iter(TOKENS))
 ENVHUB = Path(__file__).parents[2] / "examples" / "envhub" / "env.py"
 
@@ -91,7 +93,6 @@ def refusal(call, *arguments, **options):
     return str(error.value)
 
 
-@pytest.mark.slow
 def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy):
     url = machine(push_dataset, PushConfig("alice/toy", copy, private=True, tag="v1.0"))
     repo = hub.repos["datasets/alice/toy"]
@@ -104,7 +105,6 @@ def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine
     assert all(TOKEN.encode() not in content for content in hub.blobs.values())
 
 
-@pytest.mark.slow
 def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine):
     hub.blobs.clear()
     hub.uploads.clear()
@@ -119,7 +119,6 @@ def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine)
     assert file_hashes(machine(pull, "alice/cut")) == file_hashes(pristine)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("update", [False, True])
 @pytest.mark.parametrize("after", [False, True])
 def test_a_push_killed_at_any_request_is_finished_by_the_same_command(update, after, hub, machine, tmp_path):
@@ -148,7 +147,6 @@ def test_a_push_killed_at_any_request_is_finished_by_the_same_command(update, af
     assert number >= 8
 
 
-@pytest.mark.slow
 def test_a_whole_data_set_is_replaced_only_where_that_is_asked_for(hub, machine, pristine, copy):
     machine(push, pristine, "alice/twice")
     first = hub.repos["datasets/alice/twice"].tags["v3.0"]
@@ -209,7 +207,6 @@ def load_envhub(repo_id, file):
 
 
 @pytest.mark.sim
-@pytest.mark.slow
 def test_lerobots_envhub_loads_every_suite_from_the_hub(machine):
     tasks, shapes, success = machine(load_envhub, "alice/constructskill", ENVHUB)
     assert {suite: tuple(names) for suite, names in tasks.items()} == SUITES

@@ -38,6 +38,7 @@ def no_hub(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
 
 
+@pytest.mark.usefixtures("by_pytorch")
 @pytest.mark.parametrize("name", map(by_cost, BACKBONES))
 def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
     spec = BACKBONES[name]
@@ -86,6 +87,7 @@ def test_pixels_are_resized_and_normalised_with_the_backbones_own_statistics():
         torch.testing.assert_close(pixels.mean(dim=(0, 2, 3)), expected, atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_bfloat16_stays_close_and_returns_float32(weights, images):
     spec = BACKBONES["vit_tiny16"]
     features = []

@@ -11,6 +11,8 @@ from lerobot_constructskill.policies.frozen_vit.heads import REGRESSION_LOSSES
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS, SpatialSoftmax
 
+pytestmark = pytest.mark.usefixtures("by_pytorch")
+
 ABLATIONS = [{}, {"chunk_size": 1}, {"temporal_ensemble_coeff": None}, {"gripper_head": "regression"}]
 OTHER = [
     {"use_state": True},

@@ -1,6 +1,7 @@
 """The offline evaluator: what it says of policies whose errors are known, and of real checkpoints."""
 
 import json
+import shutil
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -166,14 +167,21 @@ def test_an_observation_that_is_not_there_is_a_sentence(feature_set):
         raise KeyError("a fault of ours")
 
 
+@pytest.fixture(scope="module")
+def checkpoint(config, feature_set, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("checkpoint")
+    policy = train_seeds(config(chunk_size=1), feature_set, [0], epochs=1, batch_size=16)[0]
+    save_checkpoint(policy, feature_set, folder)
+    return folder
+
+
 @pytest.mark.parametrize(
     "content", ["[]", "{}", "null", "", '{"type": "frozen_vit", "chunk_size": NaN}', '{"type": 3}']
 )
 @pytest.mark.parametrize("file", ["config.json", "model.safetensors", "policy_preprocessor.json"])
-def test_a_damaged_checkpoint_is_a_sentence(config, feature_set, tmp_path, file, content):
-    policy = train_seeds(config(chunk_size=1), feature_set, [0], epochs=1, batch_size=16)[0]
-    save_checkpoint(policy, feature_set, tmp_path)
-    (tmp_path / file).write_text(content)
+def test_a_damaged_checkpoint_is_a_sentence(checkpoint, tmp_path, file, content):
+    damaged = shutil.copytree(checkpoint, tmp_path / "damaged")
+    (damaged / file).write_text(content)
     with pytest.raises(UserError) as refusal:
-        PolicyAgent.from_pretrained(tmp_path)
+        PolicyAgent.from_pretrained(damaged)
     assert "\n" not in str(refusal.value)
