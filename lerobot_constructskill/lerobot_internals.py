@@ -5,17 +5,14 @@ else comes from LeRobot's packages by the names in their `__all__`: `from lerobo
 tests/test_lerobot_internals.py holds both rules, and says in a sentence each what a new LeRobot has changed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lerobot_constructskill.errors import MachineError
-
-if TYPE_CHECKING:
-    from datasets import Dataset
 
 NAMES = {
     # Vector environments that stand still after an episode's end, as LeRobot's own benchmarks make them.
@@ -74,24 +71,11 @@ def largest_rewards(eval_info: dict[str, Any]) -> list[float]:
 
 
 @contextmanager
-def episodes_without_statistics() -> Iterator[None]:
-    """In its block LeRobot opens a data set without those columns of its episodes that it reads and then drops.
-
-    They are the statistics, nine of ten columns, and `datasets` takes time with the square of the number. Nothing goes
-    to its cache either.
-    """
-    theirs, owner = __getattr__("load_episodes"), import_module(NAMES["load_episodes"])
-    owner.load_episodes = _kept_of_episodes
+def replaced(name: str, ours: Callable) -> Iterator[None]:
+    """In its block LeRobot calls `ours` where it would call one of `NAMES`."""
+    theirs, owner = __getattr__(name), import_module(NAMES[name])
+    setattr(owner, name, ours)
     try:
         yield
     finally:
-        owner.load_episodes = theirs
-
-
-def _kept_of_episodes(folder: Path) -> "Dataset":
-    from datasets import Dataset
-    from pyarrow.dataset import dataset
-
-    episodes = dataset(sorted(map(str, (folder / "meta" / "episodes").glob("*/*.parquet"))))
-    kept = [name for name in episodes.schema.names if not name.startswith("stats/")]
-    return Dataset(episodes.to_table(columns=kept).replace_schema_metadata())
+        setattr(owner, name, theirs)

@@ -1,30 +1,25 @@
 """What makes the merging of many demonstrations fast changes nothing."""
 
-from contextlib import nullcontext
-
 import pytest
 import torch
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDataset
 from toy import record_toy
 
-from lerobot_constructskill import lerobot_internals
 from lerobot_constructskill.demos import merge
 from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.lerobot_internals import episodes_without_statistics
+from lerobot_constructskill.lerobot_internals import load_episodes
 
 
 @pytest.fixture
 def lerobots_way(monkeypatch):
     """LeRobot reads all that there is of the episodes that it merges."""
-    monkeypatch.setattr(lerobot_internals, "episodes_without_statistics", nullcontext)
+    monkeypatch.setattr(merge, "kept_of_episodes", load_episodes)
 
 
 def test_what_lerobot_keeps_of_episodes_is_what_it_is_given(pristine):
-    theirs = LeRobotDatasetMetadata("local/toy", root=pristine)
-    with episodes_without_statistics():
-        ours = LeRobotDatasetMetadata("local/toy", root=pristine)
-    assert ours.episodes.column_names == theirs.episodes.column_names
-    assert ours.episodes.features == theirs.episodes.features and ours.episodes[:] == theirs.episodes[:]
+    ours, theirs = merge.kept_of_episodes(pristine), load_episodes(pristine)
+    assert ours.column_names == theirs.column_names
+    assert ours.features == theirs.features and ours[:] == theirs[:]
 
 
 @pytest.mark.slow
