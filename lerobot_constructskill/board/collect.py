@@ -2,16 +2,19 @@
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import yaml
 
-from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.protocol import Setting, where
 from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_rows
+
+PLACE = {"task", "episode_length", "perturb", "perturb_seed"}
+"""Arguments of an environment by which `where` tells it from others."""
 
 SEED = r"seed_(\d{1,9})"
 
@@ -37,24 +40,24 @@ def recorded_in(root: Path) -> Piles:
     return {seed: [one for path in paths for one in read_recordings(path)] for seed, paths in files.items()}
 
 
-def of_study(root: Path, store: Path, variant: str, tasks: Collection[str]) -> tuple[Piles, Failures]:
-    """What a variant's runs did in those settings of a study that evaluate one of `tasks`, and why some failed.
+def of_study(
+    root: Path, store: Path, variant: str, settings: Mapping[str, Setting], chosen: Sequence[str] | None = None
+) -> tuple[Piles, Failures]:
+    """What a variant's runs did where a submission's `settings` are evaluated, and why some failed.
+
+    Args:
+        chosen: the study's settings whose runs are meant, where several evaluate alike; all by default.
 
     Raises:
         MissingError: the study, or what one of its runs executed, is not there.
-        InputError: the study has no such variant, or not in a setting with one of the tasks.
+        InputError: the study has no such variant, or not where one of the settings is, or twice there.
     """
     check_folder(root)
     rows = read_rows(root / ROWS)
     own = rows[rows["variant"] == variant]
     if own.empty:
         raise InputError(f"The study has no variant '{variant}'; it has: {', '.join(rows['variant'].unique())}.")
-    task_of = _tasks(root / STUDY)
-    own = own[own["setting"].map(task_of).isin(tasks)]
-    if own.empty:
-        raise InputError(
-            f"'{variant}' was evaluated on none of {', '.join(tasks)}, but on {', '.join(task_of.values())}."
-        )
+    own = own[own["setting"].isin(_alike(root / STUDY, variant, own["setting"].unique(), settings, chosen))]
     piles: Piles = {}
     failures: Failures = {}
     for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
@@ -75,13 +78,44 @@ def of_study(root: Path, store: Path, variant: str, tasks: Collection[str]) -> t
     return piles, failures
 
 
-def _tasks(path: Path) -> dict[str, str]:
-    """The task of each of a study's settings."""
+def _alike(
+    path: Path, variant: str, ran: Iterable[str], settings: Mapping[str, Setting], chosen: Sequence[str] | None
+) -> list[str]:
+    """Those settings of a study, among those that a variant `ran` in, that evaluate where one of `settings` does."""
+    study = _environments(path)
+    if unknown := [name for name in chosen or () if name not in study]:
+        raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(study)}.")
+    asked = [setting.where for setting in settings.values()]
+    alike: dict[tuple, list[str]] = {}
+    ran = [name for name in ran if name in study]
+    for name in ran:
+        if study[name] in asked and name in (chosen or study):
+            alike.setdefault(study[name], []).append(name)
+    if not alike:
+        raise InputError(
+            f"'{variant}' was evaluated in none of {_told(asked)}, but in {_told(study[name] for name in ran)}."
+        )
+    if several := [names for names in alike.values() if len(names) > 1]:
+        raise InputError(
+            f"{' and '.join(several[0])} of the study evaluate alike: say whose runs are meant, such as "
+            f"--study_settings=[{several[0][-1]}]."
+        )
+    return [name for (name,) in alike.values()]
+
+
+def _environments(path: Path) -> dict[str, tuple[str, int, str]]:
+    """Where each of a study's settings evaluates, as `Setting.where`."""
     try:
         settings = yaml.safe_load(path.read_text())["settings"]
-        return {name: of["env"]["task"] for name, of in settings.items()}
+        return {
+            name: where(**{one: of["env"][one] for one in PLACE & of["env"].keys()}) for name, of in settings.items()
+        }
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         raise InputError(f"'{path}' is not a study's file, or a setting in it does not say env.task.") from None
+
+
+def _told(places: Iterable[tuple[str, int, str]]) -> str:
+    return ", ".join(f"{task}{label} ({length} steps)" for task, length, label in dict.fromkeys(places))
 
 
 def submit(
@@ -96,13 +130,13 @@ def submit(
         TakenError: `root` exists.
         InputError: an episode is missing or was recorded twice, or they do not belong together.
     """
-    claims = []
+    claims, used = [], []
     for seed, pile in sorted(({seed: [] for seed in failures} | piles).items()):
         for name, setting in settings.items():
             found = _by_start(pile, setting)
             claims += [_claim(name, setting, seed, start, found, failures.get(seed)) for start in setting.starts]
-    every = [one for pile in piles.values() for one in pile]
-    if not every:
+            used += [one for start in setting.starts for one in found.get(start, [])]
+    if not used:
         raise InputError("Nothing was recorded.")
     return write_submission(
         root,
@@ -111,8 +145,8 @@ def submit(
         suite=suite,
         settings=dict(settings),
         training_seeds=sorted(piles.keys() | failures.keys()),
-        backend=_one({one.backend for one in every}, "backends"),
-        versions=_versions(every),
+        backend=_one({one.backend for one in used}, "backends"),
+        versions=_versions(used),
     )
 
 
@@ -132,9 +166,7 @@ def _by_start(pile: Iterable[Recording], setting: Setting) -> dict[int, list[Rec
     """The recordings of a setting, by the seed of their start."""
     found: dict[int, list[Recording]] = {}
     for one in pile:
-        there = Setting(one.task, perturb=one.perturb, perturb_seed=one.perturb_seed).perturbation
-        same = (one.task, one.episode_length, there) == (setting.task, setting.episode_length, setting.perturbation)
-        if same:
+        if where(one.task, one.episode_length, one.perturb, one.perturb_seed) == setting.where:
             found.setdefault(one.evaluation_seed, []).append(one)
     return found
 

@@ -140,10 +140,18 @@ def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     """Rank of each entry that has one in a setting, and whether it is shared.
 
-    An entry is behind those whose interval over seeds lies wholly above its own, so an entry that no seeds put behind
-    another has rank 1. Two intervals that overlap can have different ranks: a third may lie above one of them alone.
+    Only those that were evaluated alike are compared: what a setting is called is up to a custom entry. An entry is
+    behind those whose interval over seeds lies wholly above its own, so an entry that no seeds put behind another has
+    rank 1. Two intervals that overlap can have different ranks: a third may lie above one of them alone.
     """
-    ranked = [entry for entry in entries if entry.is_ranked and setting in entry.standings]
-    placed = {entry.name: entry.standings[setting].placed for entry in ranked}
-    rank = {name: 1 + sum(other.low > own.high for other in placed.values()) for name, own in placed.items()}
-    return {name: (own, list(rank.values()).count(own) > 1) for name, own in rank.items()}
+    alike: dict[tuple, dict[str, Estimate]] = {}
+    for entry in entries:
+        if entry.is_ranked and setting in entry.standings:
+            evaluated = entry.said.settings[setting]
+            placed = alike.setdefault((*evaluated.where, evaluated.starts), {})
+            placed[entry.name] = entry.standings[setting].placed
+    found = {}
+    for placed in alike.values():
+        rank = {name: 1 + sum(other.low > own.high for other in placed.values()) for name, own in placed.items()}
+        found |= {name: (own, list(rank.values()).count(own) > 1) for name, own in rank.items()}
+    return found

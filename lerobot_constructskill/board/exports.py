@@ -14,7 +14,7 @@ import yaml
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.board.entries import Entry
-from lerobot_constructskill.board.protocol import STANDARD
+from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
 from lerobot_constructskill.board.submission import Claim
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 
@@ -30,6 +30,7 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
             "suite": entry.said.suite,
             "class": entry.said.settings_class,
             "level": entry.level,
+            "task": entry.said.settings[claim.setting].task,
             **{one.name: getattr(claim, one.name) for one in fields(Claim) if one.name != "actions"},
         }
         for entry in entries
@@ -103,7 +104,8 @@ def eval_results(entry: Entry, dataset_id: str) -> str:
 def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
     """leaderboard.json of vla-evaluation-harness, whose keepers still have to register the benchmark.
 
-    No overall score is given: the protocol has no number that hides the tasks. Only standard policies are in it.
+    No overall score is given: the protocol has no number that hides the tasks. Only standard policies that were
+    replayed are in it.
 
     Args:
         day: when, ISO 8601.
@@ -127,8 +129,8 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
 
 
 def _is_official(entry: Entry) -> bool:
-    """Whether it is a policy on the suite's own settings, whose names others know."""
-    return entry.said.settings_class == STANDARD and not entry.is_reference
+    """Whether it is a policy on the suite's own settings, whose names others know, and was replayed."""
+    return entry.said.settings_class == STANDARD and not entry.is_reference and entry.level != CLAIMED
 
 
 def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
@@ -139,8 +141,11 @@ def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | N
         folder = out / "exports" / entry.name
         for seed in entry.said.training_seeds:
             _write(folder / f"seed_{seed}" / "eval_info.json", json.dumps(eval_info(entry, seed), indent=2))
+        results = folder / ".eval_results" / "constructskill.yaml"
         if dataset_id and _is_official(entry):
-            _write(folder / ".eval_results" / "constructskill.yaml", eval_results(entry, dataset_id))
+            _write(results, eval_results(entry, dataset_id))
+        elif not _is_official(entry):
+            results.unlink(missing_ok=True)  # of when it was
 
 
 def _write(path: Path, text: str) -> None:

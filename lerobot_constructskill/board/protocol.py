@@ -94,6 +94,18 @@ class Setting:
         """Its label, empty where there is none; two spellings of one perturbation have one label."""
         return Perturbation(self.perturb, self.perturb_seed).label
 
+    @property
+    def where(self) -> tuple[str, int, str]:
+        """What its episodes have in common, as `where` says it."""
+        return where(self.task, self.episode_length, self.perturb, self.perturb_seed)
+
+
+def where(
+    task: str, episode_length: int | None = None, perturb: str = "", perturb_seed: int = 0
+) -> tuple[str, int, str]:
+    """Task, length and perturbation of an environment with these arguments: what beside a start decides an episode."""
+    return task, episode_length or get_task(task).horizon, Perturbation(perturb, perturb_seed).label
+
 
 @dataclass(frozen=True)
 class Suite:

@@ -1,5 +1,6 @@
 """Executes a submission's actions again, without rendering, and says which episodes end otherwise than claimed."""
 
+import os
 import random
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -11,7 +12,7 @@ from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS, Setting
 from lerobot_constructskill.board.submission import Claim, Submission, is_replayable, width
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import DECIDING, Outcome, deciding
+from lerobot_constructskill.envs.recording import DECIDING, FOLDER, Outcome, deciding
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
@@ -109,7 +110,8 @@ def open_workers(workers: int | None = None) -> AbstractContextManager[Submit]:
 
 
 def open_simulator(setting: Setting, render_backend: str = "none") -> ConstructSkillEnv:
-    """A setting's environment, by default without rendering."""
+    """A setting's environment, by default without rendering. It does not record what a recording has it do."""
+    os.environ.pop(FOLDER, None)
     return ConstructSkillEnv(
         setting.task,
         episode_length=setting.episode_length,

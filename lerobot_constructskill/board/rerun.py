@@ -79,7 +79,7 @@ def instructions(submission: Submission, value: str) -> str:
     for setting in settings.values():
         perturb = f" --env.perturb='{setting.perturb}' --env.perturb_seed={setting.perturb_seed}" * _is_drawn(setting)
         lines.append(
-            "CONSTRUCTSKILL_RECORD=recorded/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
+            "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
             f"--env.task={setting.task} --env.obs_type={declaration.about.observes} "
             f"--env.episode_length={setting.episode_length}{perturb} --eval.n_episodes={setting.episodes} "
             f"--eval.batch_size=1 --seed={first}"

@@ -21,7 +21,7 @@ from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.board.protocol import PHYSICS, SUITES, Setting, class_of
 from lerobot_constructskill.board.strangers import bounded_memory, make, read_files, read_yaml
 from lerobot_constructskill.bounds import Among, NotEmpty, Pattern, Seed, check
-from lerobot_constructskill.contract import STAGES, get_task
+from lerobot_constructskill.contract import STAGES, TASKS, get_task
 from lerobot_constructskill.envs.actions import within_reach
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
 from lerobot_constructskill.errors import InputError, first_line, plural
@@ -120,6 +120,8 @@ class Declaration:
             raise InputError(f"settings must be 1 to {MOST_SETTINGS}, not {len(self.settings)}.")
         if bad := [name for name in self.settings if not NAME.allows(name)]:
             raise InputError(f"A setting's name must be {NAME.meaning}, not {bad[0][:100]!a}.")
+        for name, setting in self.settings.items():
+            self._check_setting(name, setting)
         if len(set(self.training_seeds)) < len(self.training_seeds):
             raise InputError("training_seeds must differ.")
         if self.episodes > MOST_ROWS or self.most_bytes > MOST_ACTIONS:
@@ -129,6 +131,20 @@ class Declaration:
         for package, number in self.versions.items():
             check_line(package, "versions")
             check_line(number, "versions")
+
+    def _check_setting(self, name: str, setting: Setting) -> None:
+        named = SUITES[self.suite].settings.get(name)
+        task = named.task if named else name if name in TASKS else setting.task
+        if setting.task != task:
+            raise InputError(f"The setting {name} must be of the task {task}, or have another name than it.")
+        control = replace(setting, perturb="", perturb_seed=0)
+        if setting.perturbation and not any(
+            (one.where, one.starts) == (control.where, control.starts) for one in self.settings.values()
+        ):
+            raise InputError(
+                f"The setting {name} must have its control beside it: a setting of the same task, length and starts "
+                "without a perturbation."
+            )
 
     @property
     def settings_class(self) -> str:

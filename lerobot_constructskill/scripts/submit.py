@@ -26,6 +26,7 @@ class SubmitConfig:
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed
     study: Path | None = None  # or a study's folder
     variant: Text | None = None  # and the study's variant
+    study_settings: list[Text] | None = None  # those of the study's settings that are meant, if several evaluate alike
     store: Path = Path("outputs/store")  # where the study's runs are
     settings: Path | None = None  # YAML of settings other than the suite's: the submission is then a custom one
     failures: dict[str, str] = field(default_factory=dict)  # training seed to why its missing episodes failed
@@ -56,9 +57,7 @@ def submit(config: SubmitConfig) -> str:
     if config.study is None:
         piles = collect.recorded_in(config.recorded)
     else:
-        piles, said = collect.of_study(
-            config.study, config.store, config.variant, {setting.task for setting in settings.values()}
-        )
+        piles, said = collect.of_study(config.study, config.store, config.variant, settings, config.study_settings)
         failures = said | failures
     made = collect.submit(config.root, about, config.suite, settings, piles, failures)
     size = (config.root / EPISODES).stat().st_size

@@ -62,6 +62,21 @@ def placed(rows: list[dict], rng: np.random.Generator) -> dict:
 
 
 @forges(READ)
+def a_perturbed_setting_without_its_control(root, rng):
+    """Played with the task as it is, and called perturbed."""
+    declare(root, lambda said: said["settings"]["brick_to_bin_shifted"].update(perturb="pose=3"))
+
+
+@forges(READ)
+def a_setting_called_as_a_harder_task(root, rng):
+    def change(said):
+        said["suite"] = "ladder"
+        said["settings"]["brick_to_bin_shifted"]["task"] = "brick_to_bin_40mm"
+
+    declare(root, change)
+
+
+@forges(READ)
 def a_bit_of_the_file(root, rng):
     content = bytearray((root / EPISODES).read_bytes())
     content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
@@ -392,9 +407,3 @@ def actions_after_the_end(root, rng):
         row["actions"] = [*row["actions"], 0.0, 0.0, 0.0, 1.0]
 
     edit(root, change)
-
-
-@forges(REPLAYED)
-def an_easier_setting(root, rng):
-    """Played with the task as it is, and called perturbed."""
-    declare(root, lambda said: said["settings"]["brick_to_bin_shifted"].update(perturb="pose=3"))

@@ -14,7 +14,7 @@ import yaml
 from lerobot_constructskill.artifacts import processor
 from lerobot_constructskill.board import films
 from lerobot_constructskill.board.entries import ranks, read_entries
-from lerobot_constructskill.board.exports import eval_info
+from lerobot_constructskill.board.exports import eval_info, write_exports
 from lerobot_constructskill.board.protocol import HORIZON, SUITES, Setting
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
@@ -105,6 +105,19 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     assert not replace(good, submission=unseen).is_ranked, "nobody can replay it"
     twin = replace(good, name="twin")
     assert ranks([good, twin], "block_to_bin") == {"good": (1, True), "twin": (1, True)}
+    easier = replace(good.said, settings={"block_to_bin": replace(good.said.settings["block_to_bin"], episodes=1)})
+    other = replace(good, name="other", submission=replace(good.submission, declaration=easier))
+    assert ranks([bad, other], "block_to_bin") == {"bad": (1, False), "other": (1, False)}, "from other starts"
+
+
+def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
+    entries = [replace(entry, level=level) for entry in read_entries(BOARD) for level in ("claimed", "replayed")]
+    standard = {entry.name for entry in entries if entry.said.settings_class == "standard" and not entry.is_reference}
+    write_exports(entries[1::2], tmp_path, "today", "alice/bench")
+    assert {path.parts[-3] for path in tmp_path.glob("exports/*/.eval_results/*")} == standard != set()
+    write_exports(entries[::2], tmp_path, "today", "alice/bench")
+    assert not list(tmp_path.glob("exports/*/.eval_results/*"))
+    assert not json.loads((tmp_path / "exports" / "leaderboard.json").read_text())["results"]
 
 
 def test_what_a_stranger_writes_is_text(many, tmp_path):

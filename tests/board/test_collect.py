@@ -1,5 +1,7 @@
 """From recordings to a submission: what is missing or was recorded twice is refused, what failed stays counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -11,7 +13,8 @@ from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_r
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
 
-SETTINGS = {"block": Setting("block_to_bin", episodes=2, episode_length=2, first_start=7, perturb="pose=1")}
+CONTROL = Setting("block_to_bin", episodes=2, episode_length=2, first_start=7)
+SETTINGS = {"control": CONTROL, "block": replace(CONTROL, perturb="pose=1")}
 ABOUT = About(*["a test's"] * 7, observes="pixels")
 
 
@@ -27,8 +30,9 @@ def recording(start, value=0.01, **facts):
 def recorded(tmp_path):
     for seed in (0, 3):
         for start in (7, 8, 9):  # one more than is asked for
-            recording(start, 0.01 * (seed + 1)).write(tmp_path / "recorded" / f"seed_{seed}")
-    recording(7, perturb="").write(tmp_path / "recorded" / "seed_0")  # another setting's
+            for perturb in ("", " pose=1"):
+                recording(start, 0.01 * (seed + 1), perturb=perturb).write(tmp_path / "recorded" / f"seed_{seed}")
+    recording(7, 0.05, task="brick_to_bin").write(tmp_path / "recorded" / "seed_0")  # another setting's
     return tmp_path / "recorded"
 
 
@@ -39,7 +43,7 @@ def made(root, piles, failures=()):
 def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
     submission = made(tmp_path / "made", recorded_in(recorded))
     assert [claim.key for claim in submission.claims] == [
-        ("block", seed, start) for seed in (0, 3) for start in (7, 8)
+        (name, seed, start) for seed in (0, 3) for name in SETTINGS for start in (7, 8)
     ]
     assert submission.declaration.settings_class == "custom" and submission.declaration.training_seeds == [0, 3]
     assert submission.declaration.backend == "physx_cpu, none rendering"
@@ -47,18 +51,19 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
 
 def test_what_a_killed_process_left_is_not_read(recorded, tmp_path):
     (recorded / "seed_0" / ".host-1.block_to_bin-7.parquet").write_bytes(b"PAR1")
-    assert len(made(tmp_path / "made", recorded_in(recorded)).claims) == 4
+    assert len(made(tmp_path / "made", recorded_in(recorded)).claims) == 8
 
 
 def test_a_missing_episode_is_refused_unless_its_run_failed(recorded, tmp_path):
-    for path in (recorded / "seed_3").glob("*-8-*"):
+    for path in (recorded / "seed_3").glob("*pose*-8-*"):
         path.unlink()
     with pytest.raises(InputError, match="block, training seed 3, start 8 was not recorded"):
         made(tmp_path / "made", recorded_in(recorded))
     assert not (tmp_path / "made").exists()
     submission = made(tmp_path / "made", recorded_in(recorded), {3: "out of memory", 5: "diverged"})
-    failed = {claim.key[1:]: claim.error for claim in submission.claims if claim.error}
-    assert failed == {(3, 8): "out of memory", (5, 7): "diverged", (5, 8): "diverged"}
+    failed = {claim.key: claim.error for claim in submission.claims if claim.error}
+    diverged = dict.fromkeys([(name, 5, start) for name in SETTINGS for start in (7, 8)], "diverged")
+    assert failed == {("block", 3, 8): "out of memory"} | diverged
 
 
 def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
@@ -66,12 +71,19 @@ def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
     with pytest.raises(InputError, match="start 7 was recorded twice, with different actions"):
         made(tmp_path / "made", recorded_in(recorded))
     with pytest.raises(InputError, match="several backends"):
-        piles = {0: [recording(7), recording(8, backend="physx_cuda, gpu rendering")]}
+        piles = {0: [recording(start, perturb=perturb) for start in (7, 8) for perturb in ("", "pose=1")]}
+        piles[0][-1].backend = "physx_cuda, gpu rendering"
         made(tmp_path / "made", piles)
     with pytest.raises(InputError, match="Nothing was recorded"):
         made(tmp_path / "made", {}, {0: "diverged"})
     with pytest.raises(MissingError, match="seed_0"):
         recorded_in(tmp_path / "nowhere")
+
+
+def test_what_is_not_in_a_submission_may_have_been_recorded_elsewhere(recorded, tmp_path):
+    recording(9, 0.02, backend="physx_cuda, gpu rendering").write(recorded / "seed_0" / "fresh")
+    recording(7, task="brick_to_bin", versions="{}").write(recorded / "seed_0")
+    assert made(tmp_path / "made", recorded_in(recorded)).declaration.backend == "physx_cpu, none rendering"
 
 
 FACTS = {
@@ -87,38 +99,72 @@ FACTS = {
 
 @pytest.fixture
 def study(tmp_path):
-    """Two settings, of which one evaluates the task that a submission is made of."""
-    settings = {"block": {"env": {"task": "block_to_bin"}}, "brick": {"env": {"task": "brick_to_bin"}}}
+    """Four settings, of which one evaluates as a submission's does."""
+    here = {"task": "block_to_bin", "episode_length": 2}
+    envs = {
+        "block": here,
+        "brick": here | {"task": "brick_to_bin"},
+        "long": {"task": "block_to_bin"},
+        "moved": here | {"perturb": "pose=2"},
+    }
+    settings = {name: {"env": env} for name, env in envs.items()}
     (tmp_path / "study").mkdir()
     (tmp_path / "study" / STUDY).write_text(yaml.safe_dump({"name": "study", "settings": settings}))
     return tmp_path / "study"
 
 
+def made_of_study(root, piles, failures):
+    return submit(root, ABOUT, "bins", {"block": CONTROL}, piles, failures)
+
+
 def test_a_studys_runs_become_a_submission(study, tmp_path):
     rows, store = [], tmp_path / "store"
     for seed in range(2):
-        write_recordings([recording(7, 0.01 * (seed + 1)), recording(8)], store / "runs" / f"d{seed}" / RECORDINGS)
+        ran = [recording(start, 0.01 * (seed + 1), perturb="") for start in (7, 8)]
+        write_recordings(ran, store / "runs" / f"d{seed}" / RECORDINGS)
         for episode in range(2):
             start = {"training_seed": seed, "evaluation_seed": 7 + episode, "episode": episode}
             rows.append(Row(run=f"d{seed}", **FACTS | start))
     rows.append(Row(run="d2", **FACTS | {"training_seed": 2}, error_kind="fault", error="lost\nthe plot"))
-    rows.append(Row(run="d3", **FACTS | {"setting": "brick"}, error_kind=NOT_RUN))
+    for elsewhere in ("brick", "long", "moved"):  # these are not asked for
+        rows.append(Row(run="d3", **FACTS | {"setting": elsewhere}, error_kind=NOT_RUN))
     write_rows(rows, study / ROWS)
-    piles, failures = of_study(study, store, "ours", ["block_to_bin"])
+    piles, failures = of_study(study, store, "ours", {"block": CONTROL})
     assert {seed: len(pile) for seed, pile in piles.items()} == {0: 2, 1: 2, 2: 0} and failures == {2: "lost the plot"}
-    assert len(made(tmp_path / "made", piles, failures).claims) == 6
+    assert len(made_of_study(tmp_path / "made", piles, failures).claims) == 6
+
+
+def test_two_settings_of_a_study_that_evaluate_alike_are_never_mixed(study, tmp_path):
+    """A run that failed in one would be hidden by the one that finished in the other."""
+    said = yaml.safe_load((study / STUDY).read_text())
+    said["settings"]["again"] = said["settings"]["block"]
+    (study / STUDY).write_text(yaml.safe_dump(said))
+    store = tmp_path / "store"
+    write_recordings([recording(start, perturb="") for start in (7, 8)], store / "runs" / "d1" / RECORDINGS)
+    failed = Row(run="d0", **FACTS, error_kind="fault", error="lost")
+    write_rows(
+        [failed, *(Row(run="d1", **FACTS | {"setting": "again", "episode": one}) for one in (0, 1))], study / ROWS
+    )
+    with pytest.raises(InputError, match=r"block and again .* evaluate alike: .* --study_settings=\[again\]"):
+        of_study(study, store, "ours", {"block": CONTROL})
+    assert of_study(study, store, "ours", {"block": CONTROL}, ["block"])[1] == {0: "lost"}
+    piles, failures = of_study(study, store, "ours", {"block": CONTROL}, ["again"])
+    assert len(piles[0]) == 2 and not failures
+    with pytest.raises(InputError, match="has no setting 'nowhere'; it has: again, block"):
+        of_study(study, store, "ours", {"block": CONTROL}, ["nowhere"])
 
 
 def test_what_a_study_does_not_have_is_said(study, tmp_path):
-    def collected(row, variant="ours", tasks=("block_to_bin",)):
+    def collected(row, variant="ours", setting=CONTROL):
         write_rows([row], study / ROWS)
-        return of_study(study, tmp_path / "store", variant, tasks)
+        return of_study(study, tmp_path / "store", variant, {"one": setting})
 
     row = Row(run="d9", **FACTS)
     with pytest.raises(InputError, match="it has: ours"):
         collected(row, "theirs")
-    with pytest.raises(InputError, match="none of tile_to_grid, but on block_to_bin, brick_to_bin"):
-        collected(row, tasks=["tile_to_grid"])
+    for other in (Setting("tile_to_grid"), replace(CONTROL, episode_length=3), replace(CONTROL, perturb="pose=3")):
+        with pytest.raises(InputError, match=r"in none of .*, but in block_to_bin \(2 steps\)"):
+            collected(row, setting=other)
     with pytest.raises(MissingError, match="before actions were kept"):
         collected(row)
     with pytest.raises(MissingError, match="not run block/ours/seed_0 yet"):

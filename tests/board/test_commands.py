@@ -54,6 +54,11 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     said = call("constructskill-submit", *flags, f"--recorded={tmp_path / 'recorded'}", f"--root={entry}")
     assert "custom, 10 episodes of 2 training seeds" in said
 
+    recorded = {"CONSTRUCTSKILL_RECORD": str(tmp_path / "recorded" / "seed_0")}  # as it may still be exported
+    before = {path: path.read_bytes() for path in tmp_path.rglob("recorded/*/*")}
+    said = call("constructskill-verify", f"--root={entry}", **recorded)
+    assert "10 of 10 episodes replayed (30 steps)" in said
+    assert {path: path.read_bytes() for path in tmp_path.rglob("recorded/*/*")} == before
     said = call("constructskill-verify", f"--root={entry}", "--value=beef")
     first = int(said.partition("fresh starts are ")[2].split()[0])
     assert first >= FIRST_FRESH and f"--seed={first}" in said and f"first_start: {first}" in said
