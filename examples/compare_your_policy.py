@@ -31,7 +31,9 @@ def main(root: Path, arm: str, checkpoints: list[str]) -> None:
     theirs = seed_outcomes(rows)
     agents = [PolicyAgent.from_pretrained(Path(checkpoint)) for checkpoint in checkpoints]
     seeds = range(study["eval_seed"], study["eval_seed"] + study["episodes"])
-    outcomes = [outcome for _, outcome in roll_out(agents, study["settings"][arm.partition("/")[0]]["env"], seeds)]
+    env = study["settings"][arm.partition("/")[0]]["env"]
+    by_number = dict(roll_out(agents, env, seeds))  # each as it ends
+    outcomes = [by_number[number] for number in range(len(agents))]
     if failed := [outcome.error for outcome in outcomes if outcome.error]:
         sys.exit(f"{len(failed)} of {len(agents)} checkpoints failed, the first with: {failed[0]!r}")
     placed = [sum(episode.placed for episode in outcome.episodes) for outcome in outcomes]

@@ -5,7 +5,12 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH" HF_HUB_OFFLINE=1
-OUT="${OUT:-outputs/smoke_evaluation}" TASK="${TASK:-brick_to_bin}"
+TASK="${TASK:-brick_to_bin}"
+OUT="${OUT:-outputs/smoke_evaluation/$TASK}"
+if [ -e "$OUT/trained" ] && [ "$(cat "$OUT/trained")" != "$TASK" ]; then
+    echo "$OUT is of the task $(cat "$OUT/trained"); name another OUT for $TASK." >&2
+    exit 1
+fi
 
 # Random weights of the smallest network: nothing has to be downloaded.
 policy=(--policy.type=frozen_vit --policy.backbone=vit_tiny16 --policy.backbone_pretrained=false
@@ -17,7 +22,7 @@ eval=(--eval.n_episodes=1 --eval.batch_size=1 --eval.use_async_envs=false)
     --root="$OUT/demonstrations"
 [ -e "$OUT/trained" ] || { rm -rf "$OUT/train"; lerobot-train "${policy[@]}" --dataset.repo_id=local/smoke \
     --dataset.root="$OUT/demonstrations" --dataset.episodes='[0]' --batch_size=1 --num_workers=0 --steps=1 \
-    --save_freq=1 "${env[@]}" "${eval[@]}" --env_eval_freq=1 --output_dir="$OUT/train" && touch "$OUT/trained"; }
+    --save_freq=1 "${env[@]}" "${eval[@]}" --env_eval_freq=1 --output_dir="$OUT/train" && echo "$TASK" > "$OUT/trained"; }
 lerobot-eval --policy.path="$OUT/train/checkpoints/last/pretrained_model" "${env[@]}" "${eval[@]}" \
     --output_dir="$OUT/eval"
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_values
-from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, get_task, held_out
+from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
 from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
@@ -34,6 +34,9 @@ MEANINGS = {
     "next.success": "whether the object is placed after the action",
     "next.done": "whether the episode ends with the action",
 }
+
+TURNS = "; turns in rad about the same axes, right-handed"
+"""What an action also is in a task that turns."""
 
 
 class Provenance:
@@ -99,7 +102,7 @@ def render(facts: dict[str, Any]) -> str:
         seed_start=DEMO_SEED_START,
         cameras=cameras,
         features={name: feature for name, feature in features.items() if name in MEANINGS},
-        meanings=MEANINGS,
+        meanings=MEANINGS | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*task.action_names} else {}),
         sigma_mm=[round(float(value), 2) for value in sigma],
         rename_map=_rename_map([camera.key for camera in cameras]),
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 from lerobot_constructskill.bounds import Count, check
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
-from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.noise import NoNoise
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
@@ -32,7 +32,7 @@ class CheckTaskConfig:
 
     task: str  # a name in `contract.TASKS`
     states: Count = 100  # random initial states, without rendering
-    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
+    noise: NoNoise = field(default_factory=NoNoise)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     folder: Path = Path("outputs/check")  # where the contact sheet goes
     tests: bool = True  # run the registry tests of this task, where this is a checkout
@@ -103,7 +103,7 @@ def save_contact_sheet(config: CheckTaskConfig) -> Path:
             columns[phase] = (obs["pixels"]["base"], env.render())
 
     with Progress(desc="contact sheet", unit="step") as bar:
-        demonstrate(env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START, watch=keep)
+        demonstrate(env, expert, NoNoise(), DEMO_SEED_START, watch=keep)
     env.close()
     tiles = [[np.asarray(Image.fromarray(image).resize((TILE, TILE))) for image in pair] for pair in columns.values()]
     path = config.folder / f"{config.task}.png"

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
-from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.noise import NoNoise
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
 
@@ -21,7 +21,7 @@ class FilmConfig:
     out: Path | None = None  # the video; default: outputs/<task>.mp4
     view: View = "close"  # a close-up (close), or what the policy sees (policy)
     seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
-    noise: NoiseConfig = field(default_factory=lambda: NoiseConfig(sigma=0.0))
+    noise: NoNoise = field(default_factory=NoNoise)
     perturb: str = ""  # axis=level, separated by commas, as in the environment
 
     def __post_init__(self):

@@ -10,7 +10,9 @@ from lerobot_constructskill.scripts.console import run
 
 @dataclass
 class PushConfig:
-    """Check a data set, write its card if it has none, upload it to the Hub as one commit and tag it.
+    """Check a data set, write its card, upload it to the Hub as one commit and tag it.
+
+    A card that somebody changed stays as it is; one that was generated under another name gets this one.
 
     After an interruption the same command continues.
     """
@@ -34,6 +36,7 @@ def push_dataset(config: PushConfig) -> str:
         ValueError: a check found something wrong.
         OSError: the Hub refused, or the connection broke.
     """
+    from lerobot_constructskill.dataset.card import card_facts, render
     from lerobot_constructskill.dataset.checks import CHECKS, complaints
     from lerobot_constructskill.dataset.dataset import open_dataset
     from lerobot_constructskill.dataset.hub import push
@@ -47,7 +50,8 @@ def push_dataset(config: PushConfig) -> str:
         raise InputError(
             f"{config.root} is not pushed, because the checks found {plural(len(wrong), 'fault')}; {wrong[0]}"
         )
-    if not (config.root / "README.md").is_file():
+    card = config.root / "README.md"
+    if not card.is_file() or card.read_text() == render(card_facts(data)):
         print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"
 

@@ -19,6 +19,7 @@ from lerobot_constructskill.artifacts.digests import digest, file_sha256, finish
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import get_task, held_out
+from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.run import make_checkpoint
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
@@ -49,7 +50,7 @@ class Job:
         runs: they differ in their seeds and, where each seed has demonstrations of its own, in these.
         store: where everything is made.
         times: folder in which is noted what took how long.
-        workers: processes that generate demonstrations.
+        workers: processes that generate demonstrations and simulate in rounds of DAgger.
     """
 
     runs: tuple[Run, ...]
@@ -122,7 +123,8 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
     if arm.dagger:
         for run in runs:
             with timed(job.times, "rounds of DAgger"):
-                make_checkpoint(run.dagger, arm.dagger.rounds, job.store)
+                plan = Plan(replace(run.dagger.config, workers=job.workers))
+                make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
     dataset = obtain(job, arm.demonstrations)
     writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}

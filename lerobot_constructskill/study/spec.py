@@ -159,7 +159,8 @@ class Options:
         together: seeds that are trained and evaluated in one pass.
         executor: "processes" (this machine) or "ray" (extra `distributed`; a cluster needs the study's folder and the
             store on a file system that all its machines share).
-        workers: processes that generate demonstrations; jobs at a time on a Ray of this machine.
+        workers: processes that generate demonstrations and simulate in rounds of DAgger; jobs at a time on a Ray of
+            this machine.
         retry_failed: make runs again that failed before.
 
     Raises:

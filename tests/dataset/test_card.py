@@ -61,6 +61,12 @@ def test_the_card_of_another_task_evaluates_that_task_and_tells_its_noise(data):
     assert card.count("--env.task=brick_on_brick") == 2 and "and 3.0 mm\nin RELEASE while" in card
 
 
+def test_the_card_says_in_what_unit_an_action_turns(card, data):
+    facts = card_facts(data)
+    turned = render(facts | {"generator": facts["generator"] | {"task": "brick_to_bin_turned"}})
+    assert "turns in rad" in turned and "turns in rad" not in card
+
+
 def test_every_column_of_the_data_set_is_on_the_card(card, data):
     named = set(re.findall(r"^\| `([\w.]+)` \|", card, re.MULTILINE))
     bookkeeping = {"timestamp", "frame_index", "episode_index", "index", "task_index"}

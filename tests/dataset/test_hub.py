@@ -15,6 +15,7 @@ from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.dataset.hub import pull, push
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.errors import TakenError
+from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
 
 pytestmark = pytest.mark.slow
@@ -94,6 +95,7 @@ def refusal(call, *arguments, **options):
 
 
 def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy):
+    write_card(CardConfig(copy))  # as generation does, under the name that it was given
     url = machine(push_dataset, PushConfig("alice/toy", copy, private=True, tag="v1.0"))
     repo = hub.repos["datasets/alice/toy"]
     assert repo.private and set(repo.tags) == {"v3.0", "v1.0"} and repo.branches["main"] in url
@@ -157,6 +159,15 @@ def test_a_whole_data_set_is_replaced_only_where_that_is_asked_for(hub, machine,
     repo = hub.repos["datasets/alice/twice"]
     files = repo.commits[repo.tags["v3.0"]]
     assert repo.tags["v3.0"] != first and "README.md" in files and "meta/modality.json" not in files
+
+
+def test_a_card_that_somebody_changed_is_pushed_as_it_is(hub, machine, copy):
+    write_card(CardConfig(copy))
+    with (copy / "README.md").open("a") as file:
+        file.write("What our robot does with it.\n")
+    changed = (copy / "README.md").read_bytes()
+    machine(push_dataset, PushConfig("alice/changed", copy))
+    assert (machine(pull, "alice/changed") / "README.md").read_bytes() == changed
 
 
 def test_a_damaged_data_set_does_not_leave_the_machine(hub, copy):

@@ -7,6 +7,9 @@ from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.dart import fit_covariance
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
+from lerobot_constructskill.parsing import parse
+from lerobot_constructskill.scripts.check_task import CheckTaskConfig
+from lerobot_constructskill.scripts.film import FilmConfig
 
 COVARIANCE = np.array([[9.0, 3.0, 0.0], [3.0, 4.0, -1.0], [0.0, -1.0, 1.0]]) * 1e-6
 FITTED = COVARIANCE.tolist()
@@ -26,6 +29,15 @@ def test_noise_has_the_covariance_of_its_model(model):
     np.testing.assert_allclose(config.root @ config.root, expected, atol=1e-15)
     np.testing.assert_allclose(np.cov(noise[:, :3].T), expected, atol=3e-7)
     assert (noise[:, 3] == 0).all()
+
+
+@pytest.mark.parametrize("config_class", [CheckTaskConfig, FilmConfig])
+def test_what_is_without_noise_stays_so_where_another_flag_of_noise_is_given(config_class):
+    """draccus fills the rest in from the class, not from the default value."""
+    for flags in ([], ["--noise.clip=0.05"], ["--noise.release_sigma=0.003"]):
+        task = ["--task=brick_to_bin"]
+        assert parse(config_class, task + flags).noise.sigma == 0
+    assert parse(config_class, [*task, "--noise.sigma=0.01"]).noise.sigma == 0.01
 
 
 def test_noise_in_release_ends_when_the_jaws_open_and_changes_no_other_phase():

@@ -17,7 +17,8 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
-from lerobot_constructskill.study.execute import EPISODES, _let_through, _together
+from lerobot_constructskill.study import execute
+from lerobot_constructskill.study.execute import EPISODES, Job, _let_through, _together
 from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
@@ -358,6 +359,17 @@ def test_a_torn_line_of_times_is_left_out(tmp_path):
     with timed(tmp_path, "evaluation"):
         pass
     assert seconds_by_stage(tmp_path) == {"encoding": 0.0, "evaluation": 0.0}
+
+
+def test_rounds_of_dagger_have_the_studys_workers(tmp_path, monkeypatch):
+    """What makes the checkpoint is left out."""
+    plans = []
+    monkeypatch.setattr(execute, "make_checkpoint", lambda plan, rounds, store: plans.append(plan))
+    driven = Variant({"type": "frozen_vit", "backbone": "dinov2_vits14"}, seeds=2, dagger="smoke")
+    runs = [run for run in list_runs(study(variants={"driven": driven})) if run.arm.name == "driven"]
+    execute._fit(Job(tuple(runs), Store(tmp_path / "store"), tmp_path, workers=7), runs)
+    assert [(plan.config.workers, plan.base.workers, plan.config.seed) for plan in plans] == [(7, 7, 0), (7, 7, 1)]
+    assert [plan.checkpoint(0).digest for plan in plans] == [run.dagger.checkpoint(0).digest for run in runs]
 
 
 def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
