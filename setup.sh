@@ -149,9 +149,12 @@ system_is_ready() {
     [[ -z "$(missing_packages "${PACKAGES[@]}")" ]] && new_enough "$(installed_version mesa-vulkan-drivers)"
 }
 
+# An image may come without apt's lists; what it could install then is what it has.
+knows_of_packages() { compgen -G "${1:-}/var/lib/apt/lists/*_Packages*" >/dev/null; }
+
 # All is installed, but Mesa is old, and apt has no newer one (Ubuntu 22.04).
 is_as_ready_as_can_be() {
-    [[ -z "$(missing_packages "${PACKAGES[@]}")" && $(os_release ID) != debian ]] &&
+    knows_of_packages && [[ -z "$(missing_packages "${PACKAGES[@]}")" && $(os_release ID) != debian ]] &&
         ! new_enough "$(candidate_version mesa-vulkan-drivers)"
 }
 

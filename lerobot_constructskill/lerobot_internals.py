@@ -17,7 +17,8 @@ from lerobot_constructskill.errors import MachineError
 NAMES = {
     # Vector environments that stand still after an episode's end, as LeRobot's own benchmarks make them.
     "_LazyAsyncVectorEnv": "lerobot.envs.utils",
-    "freeze_after_episode_end": "lerobot.envs.utils",
+    "FreezeAfterEpisodeEnd": "lerobot.envs.utils",
+    "NEW_ROLLOUT_OPTION": "lerobot.envs.utils",
     # Statistics and files of data sets, read and written as LeRobot does it.
     "compute_episode_stats": "lerobot.datasets.compute_stats",
     "decode_video_frames": "lerobot.datasets.video_utils",

@@ -29,7 +29,7 @@ AXES = {
     "light": Axis("relative change of the lights' brightness, and of their direction", (0.2, 0.4, 0.6)),
     "texture": Axis("relative change of the brick's and the ground's colour, with another pattern", (0.1, 0.2, 0.4)),
     "size": Axis("factor of the square root of a brick's dimension: EN 771-1's categories T2 and T1", (0.25, 0.40)),
-    "distractors": Axis("loose offcuts beside the work", (1, 2, 4)),
+    "distractors": Axis("fixed offcuts beside the work", (1, 2, 4)),
     "pose": Axis("standard deviation of the robot's initial joint angles in radians", (0.01, 0.02, 0.04)),
     "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16)),
 }

@@ -161,6 +161,15 @@ def test_setup_judges_mesa(version: str, good: bool) -> None:
     assert (shell('new_enough "$1"', version).returncode == 0) is good
 
 
+@pytest.mark.parametrize("lists", [False, True])
+def test_setup_asks_apt_anew_where_its_lists_are_gone(lists: bool, tmp_path: Path) -> None:
+    """An old Mesa is as good as it gets only where apt knows what it could install."""
+    (tmp_path / "var/lib/apt/lists").mkdir(parents=True)
+    if lists:
+        (tmp_path / "var/lib/apt/lists/mirror_main_binary-amd64_Packages.lz4").touch()
+    assert (shell('knows_of_packages "$1"', tmp_path).returncode == 0) is lists
+
+
 @pytest.mark.parametrize(
     ("machine", "refused", "said"),
     [

@@ -43,7 +43,7 @@ def test_lerobot_exports_what_we_import_from_it():
 
 CALLS = {
     "_LazyAsyncVectorEnv": (("env_fns", "observation_space", "action_space", "metadata"), {}),
-    "freeze_after_episode_end": (("env_fn",), {}),
+    "FreezeAfterEpisodeEnd": (("env",), {}),
     "compute_episode_stats": (("columns", "features"), {}),
     "decode_video_frames": (("path", "times", "tolerance"), {"return_uint8": True}),
     "load_episodes": (("folder",), {}),

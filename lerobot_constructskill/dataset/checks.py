@@ -158,9 +158,11 @@ def check_episodes(data: DataSet) -> Iterator[str]:
         yield from _check_episode(data, span, f"Episode {episode['episode_index']}", episode)
     if not np.array_equal(data.column("index"), np.arange(rows)):
         yield "index does not count the frames of the data set one by one."
-    for name, count in (("total_episodes", len(spans)), ("total_frames", rows)):
-        if data.info[name] != count:
-            yield f"info.json says {name} is {data.info[name]}, but there are {count}."
+    if (other := data.column("task_index") != 0).any():
+        yield f"task_index is of another instruction than the only one in {plural(other.sum(), 'frame')}."
+    for name, count in (("total_episodes", len(spans)), ("total_frames", rows), ("total_tasks", len(data.tasks))):
+        if data.info.get(name) != count:
+            yield f"info.json says {name} is {data.info.get(name)}, but there are {count}."
 
 
 def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[str]:

@@ -15,6 +15,9 @@ FLAT = 2.0
 FROZEN_FRAMES, FROZEN_DISTANCE = 5, 0.03
 """Equal pictures in a row, and metres that the arm moved meanwhile, that make a frozen camera."""
 
+LATE = 1e-4 * FPS
+"""Share of a frame by which one may be late: LeRobot reads none that is off by more than 0.1 ms."""
+
 
 def check_videos(data: DataSet) -> Iterator[str]:
     """Frame counts and time stamps of the packets, without decoding."""
@@ -24,7 +27,7 @@ def check_videos(data: DataSet) -> Iterator[str]:
             path = data.video(camera, episode)
             start = frames.setdefault(path, 0)
             first, last = (episode[f"videos/{camera}/{edge}_timestamp"] * FPS for edge in ("from", "to"))
-            if abs(first - start) > 0.01 or abs(last - first - episode["length"]) > 0.01:
+            if abs(first - start) > LATE or abs(last - first - episode["length"]) > LATE:
                 yield (
                     f"Episode {episode['episode_index']} has {episode['length']} rows and frames "
                     f"{first:.2f} to {last:.2f} of {camera}, which do not follow on frame {start}."

@@ -185,7 +185,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
         commit = api.upload_folder(**repo, folder_path=root, allow_patterns=PUSHED, delete_patterns=stale)
-        for name in filter(None, (tag, CODEBASE_VERSION)):
+        for name in dict.fromkeys(filter(None, (tag, CODEBASE_VERSION))):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)
             api.create_tag(**repo, tag=name)

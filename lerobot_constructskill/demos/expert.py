@@ -8,7 +8,7 @@ from typing import Annotated, Protocol
 import numpy as np
 
 from lerobot_constructskill.bounds import Range, Steps, check
-from lerobot_constructskill.contract import Task
+from lerobot_constructskill.contract import ACTION_SCALE, Task
 
 
 class Phase(StrEnum):
@@ -75,7 +75,7 @@ class Progress:
 
 
 Gain = Annotated[float, Range(above=0, most=100)]
-Step = Annotated[float, Range(above=0, most=1, unit="m")]
+Step = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
 Compliance = Annotated[float, Range(0, 1, unit="m/N")]
 Height = Annotated[float, Range(-1, 1, unit="m")]
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import numpy as np
 
 from lerobot_constructskill.bounds import Among, Range, check
-from lerobot_constructskill.contract import GRIPPER_CLOSED
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
@@ -15,7 +15,7 @@ FITTED = ("isotropic", "dart")
 
 Sigma = Annotated[float, Range(0, 1, unit="m")]
 PhaseName = Annotated[str, Among(tuple(Phase))]
-Clip = Annotated[float, Range(above=0, most=1, unit="m")]
+Clip = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,11 @@ from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
+from lerobot_constructskill.envs.freeze import frozen_at_end
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
-from lerobot_constructskill.lerobot_internals import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot_constructskill.lerobot_internals import _LazyAsyncVectorEnv
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
@@ -103,5 +104,5 @@ class ConstructSkillEnvConfig(EnvConfig):
             probe = self._make_env(task)
             return _LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
         return gym.vector.SyncVectorEnv(
-            [freeze_after_episode_end(fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+            [partial(frozen_at_end, fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
         )

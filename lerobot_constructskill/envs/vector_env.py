@@ -6,6 +6,7 @@ Not yet run on a GPU: here one environment is tested against `ConstructSkillEnv`
 
 import os
 from collections.abc import Sequence
+from numbers import Integral
 from typing import Any
 
 import gymnasium as gym
@@ -21,7 +22,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
     """`n_envs` copies of a task in one simulator.
 
     An environment whose episode has ended is frozen: until the next `reset` it repeats its last observation and info
-    with reward 0, as LeRobot's `freeze_after_episode_end` does. Every episode's initial state comes from its own seed,
+    with reward 0, as LeRobot's `FreezeAfterEpisodeEnd` does. Every episode's initial state comes from its own seed,
     whatever the other environments do.
 
     Args:
@@ -53,7 +54,8 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode in every environment; an integer seeds environment i with `seed + i`."""
-        if isinstance(seed, int):
+        if isinstance(seed, Integral):
+            super().reset(seed=int(seed))
             seed = range(seed, seed + self.num_envs)
         seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
         if self._env is None:

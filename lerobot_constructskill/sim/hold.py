@@ -11,6 +11,9 @@ from mani_skill.utils.geometry.rotation_conversions import quaternion_invert, qu
 
 from lerobot_constructskill.contract import ACTION_SCALE, ROTATION_SIGN, TRANSLATION
 
+HOLDING = "pd_ee_delta_pose"
+"""The control mode whose actions have the channels that are overwritten; others are left to themselves."""
+
 N_TRANSLATION = len(TRANSLATION)
 
 

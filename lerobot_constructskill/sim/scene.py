@@ -30,7 +30,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.sim.hold import Hold
+from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import looking_from, seen_from
 from lerobot_constructskill.sim.rendering import best_render_backend
@@ -299,7 +299,7 @@ class PickPlaceEnv(BaseEnv):
     # Action
 
     def _step_action(self, action):
-        if self.hold is not None:
+        if self.hold is not None and action is not None and self.control_mode == HOLDING:
             action = self.hold.apply(common.to_tensor(action, device=self.device), self.agent.tcp.pose.q)
         return super()._step_action(action)
 

@@ -56,6 +56,15 @@ def at(row, value):
     return change
 
 
+def late_video(root):
+    """By more than LeRobot lets pass, and less than a hundredth of a frame."""
+    for path in (root / "meta/episodes").rglob("*.parquet"):
+        table = pd.read_parquet(path)
+        edges = [name for name in table.columns if name.endswith(("/from_timestamp", "/to_timestamp"))]
+        table[edges] += 4e-4
+        table.to_parquet(path)
+
+
 def frames(change):
     """A corruption of the video: `change` takes the list of (H, W, 3) pictures and returns it."""
 
@@ -154,11 +163,14 @@ CORRUPTIONS = {
     "noise of another seed": (rows(noise_of_another_seed), "Noise", "model draws from the seed"),
     "a lost frame": (rows(lambda table: table.drop(index=50)), "Episodes", "Episode 0 has a gap"),
     "a lost episode": (rows(lambda t: t[t.episode_index != 4]), "Episodes", "rows have the episodes 0, 1, 2, 3, 5"),
+    "another instruction's number": (column("task_index", at(7, 1)), "Episodes", "another instruction .* in 1 frame"),
+    "no instruction": (metadata("meta/info.json", lambda i: i.update(total_tasks=0)), "Episodes", "total_tasks is 0"),
     "a wrong total": (metadata("meta/info.json", lambda i: i.update(total_frames=7)), "Episodes", "total_frames is 7"),
     "phases out of order": (column("phase", at(slice(0, 3), "CARRY")), "Episodes", "six phases in order"),
     "a failed demonstration": (column("next.success", lambda s: s & False), "Episodes", "Episode 0 does not end"),
     "two seeds in an episode": (column("sim.seed", at(3, 1_000_007)), "Episodes", "several seeds"),
     "a late time stamp": (column("timestamp", at(9, 0.5)), "Time stamps", "worst by 0.0500 s"),
+    "a video read too late": (late_video, "Videos", "which do not follow on frame 0"),
     "a dropped video frame": (frames(lambda pictures: pictures[:-1]), "Videos", "frames, but its episodes have"),
     "a truncated video": (truncate(VIDEO), "Videos", "cannot be read"),
     "black pictures": (frames(black), "Pictures", "observation.images.base shows nothing in 10 frames, first 300"),

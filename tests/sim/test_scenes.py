@@ -244,6 +244,18 @@ def test_a_held_hand_stays_level_under_the_brick_and_keeps_the_yaw_it_was_given(
     torch.testing.assert_close(level[:, [0, 3]], torch.zeros(1, 2), atol=2e-3, rtol=0)
 
 
+def test_a_hand_that_is_driven_by_its_joints_is_not_held():
+    """Their numbers stand where other actions have rotations."""
+    env = make("brick_to_bin_10mm", control_mode="pd_joint_pos")
+    env.reset(seed=0)
+    joints = env.agent.robot.get_qpos()[0]
+    for _ in range(20):
+        env.step(np.append(joints[:7], 1.0))
+    torch.testing.assert_close(env.agent.robot.get_qpos()[0, :7], joints[:7], atol=0.02, rtol=0)
+    env.step(None)
+    env.close()
+
+
 def test_privileged_state_is_what_the_contract_says(blind):
     blind.reset(seed=0)
     state = blind.privileged_state()
