@@ -117,7 +117,8 @@ class FeatureTrainer:
         if policy.config.use_state and OBS_STATE not in demonstrations.meta.features:
             return None
         features = obtain_features(policy.config, demonstrations, store)
-        preprocess, _ = make_pre_post_processors(policy.config, str(checkpoint))
+        on_device = {"device_processor": {"device": policy.config.device}}
+        preprocess, _ = make_pre_post_processors(policy.config, str(checkpoint), preprocessor_overrides=on_device)
         return heldout_mse([policy], features, held_out, preprocess)[0]
 
 

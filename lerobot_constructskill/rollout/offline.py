@@ -178,8 +178,8 @@ def predict(
 @torch.inference_mode()
 def _chunks(policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict) -> tuple:
     """Labels (B, A) and chunks (B, C, A) of a batch."""
-    seen = {name: value for name, value in batch.items() if name.startswith("observation.")} | {"task": batch["task"]}
-    seen = preprocess(seen)
+    seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
+    seen = preprocess(seen | {name: batch[name] for name in ("task", "index")})
     try:
         chunk = policy.predict_action_chunk(seen)
     except NotImplementedError:
@@ -196,7 +196,16 @@ def _chunks(policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callabl
 
 
 def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
-    """The data set with as many observations a frame as the policy was trained on."""
+    """The data set with as many observations a frame as the policy was trained on.
+
+    A policy class whose policies read what was computed of images takes part by a method `read_features`.
+
+    Raises:
+        InputError: another encoder than the policy's made the data set's features.
+        MissingError: the data set lacks features that it needs.
+    """
+    if hasattr(policy, "read_features"):
+        policy.read_features(dataset.meta)
     times = resolve_delta_timestamps(policy.config, dataset.meta) or {}
     times = {name: offsets for name, offsets in times.items() if name.startswith("observation.")}
     if not times:

@@ -8,6 +8,7 @@ import sys
 import pytest
 import torch
 
+from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit import precision as precision_module
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -48,6 +49,7 @@ def test_bfloat16_by_name_is_refused_where_it_would_be_emulated(machine, make_po
         with pytest.raises(ValueError, match=r"60 times slower .* backbone_precision=auto, .* or float32") as refusal:
             call()
         assert "\n" not in str(refusal.value)
+        assert isinstance(refusal.value, MachineError), "a study stops there; it is no result of a run"
 
 
 def test_a_checkpoint_keeps_its_precision_where_another_would_be_faster(machine, make_policy, tmp_path):

@@ -7,6 +7,8 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.features import trainer
 from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
@@ -107,6 +109,20 @@ def test_the_held_out_error_is_that_of_every_fourth_episode(validation, fields, 
 def test_without_a_held_out_episode_there_is_no_error(config, feature_set):
     policies = train_seeds(config(), feature_set, [0], epochs=1, batch_size=16)
     assert heldout_mse(policies, feature_set, [], lambda batch: batch) == [None]
+
+
+def test_the_held_out_error_of_a_checkpoint_from_a_gpu_is_measured_here(config, feature_set, tmp_path, monkeypatch):
+    """There is none: its files say that it was. The features are there, so that nothing is encoded."""
+    fields = config(use_state=True)
+    (policy,) = train_seeds(fields, feature_set, [0], **TRAINING)
+    save_checkpoint(policy, feature_set, tmp_path)
+    path = tmp_path / "policy_preprocessor.json"
+    path.write_text(path.read_text().replace('"device": "cpu"', '"device": "cuda"'))
+    assert "cuda" in path.read_text()
+    monkeypatch.setattr(trainer, "obtain_features", lambda *_: feature_set)
+    (measured,) = FeatureTrainer().heldout_mse(fields, [tmp_path], feature_set, HELD_OUT, Store(tmp_path / "store"))
+    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=feature_set.meta.stats)
+    assert measured == pytest.approx(heldout_mse([policy], feature_set, HELD_OUT, preprocess)[0], rel=1e-5)
 
 
 def test_a_checkpoint_is_lerobots_own_and_acts_alike(config, feature_set, tmp_path):

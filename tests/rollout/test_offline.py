@@ -11,7 +11,7 @@ import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
 
-from lerobot_constructskill.errors import UserError
+from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict, shown
@@ -132,6 +132,30 @@ def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_s
         assert row["rmse_m"] ** 2 / 3 == pytest.approx(error, rel=1e-4)
     assert rows[0]["weights_sha256"] != rows[1]["weights_sha256"]
     assert rows[0]["dataset_sha256"] == rows[1]["dataset_sha256"] and rows[0]["episodes"] == "3,7"
+
+
+@pytest.mark.parametrize("readout", ["spatial_softmax", "mean"])
+def test_a_readout_of_patches_is_evaluated_on_their_features(readout, config, feature_set, tmp_path):
+    fields = config(chunk_size=1, readout=readout)
+    (trained,) = train_seeds(fields, feature_set, [0], epochs=1, batch_size=16, held_out=EPISODES)
+    save_checkpoint(trained, feature_set, tmp_path / "checkpoint")
+    found = [str(tmp_path / "checkpoint")]
+    asked = OfflineConfig(found, "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
+    evaluate_offline(asked)
+    (row,) = json.loads((tmp_path / "offline.json").read_text())
+    preprocess, _ = make_pre_post_processors(trained.config, dataset_stats=feature_set.meta.stats)
+    (error,) = heldout_mse([trained], feature_set, EPISODES, preprocess)
+    assert row["rmse_m"] ** 2 / 3 == pytest.approx(error, rel=1e-4)
+
+
+def test_features_of_another_encoder_are_not_scored(checkpoint, feature_set, tmp_path):
+    other = shutil.copytree(feature_set.root, tmp_path / "other")
+    info = json.loads((other / "meta" / "info.json").read_text())
+    info["features"]["observation.features.base"]["info"]["weights_sha256"] = "0" * 64
+    (other / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(InputError, match="not made by this policy's encoder: weights_sha256 0000"):
+        evaluate_offline(OfflineConfig([str(checkpoint)], "local/random", other, episodes=EPISODES, out=tmp_path))
+    assert not (tmp_path / "offline.json").exists()
 
 
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):

@@ -259,6 +259,24 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
             )
 
+    def read_features(self, meta: Any) -> None:
+        """Read a data set's features from now on, if it has those of the policy's camera in place of its images.
+
+        Args:
+            meta: the data set's `LeRobotDatasetMetadata`.
+
+        Raises:
+            ValueError: another encoder made them.
+            FileNotFoundError: it lacks the patch features that the readout takes.
+        """
+        self.config.set_dataset_feature_metadata(meta.features)
+        if self.config.feature_column is None:
+            return
+        self._check_column(self.config.backbone_sha256)
+        self.patches_root = meta.root
+        if self.readout.reads_patches:
+            open_patches(meta.root)
+
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
 

@@ -4,7 +4,7 @@ import os
 
 import torch
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MachineError
 
 PRECISIONS = ("float32", "bfloat16")
 
@@ -48,14 +48,18 @@ def resolve_precision(asked: str, device: torch.device | str, made_in: str | Non
     return (made_in or native_precision(device)) if asked == AUTO else asked
 
 
+class NotNativeError(MachineError, ValueError):
+    """A device would have to emulate a precision. Another machine need not, so it is no result of a run."""
+
+
 def check_native(precision: str, device: torch.device | str) -> None:
     """Refuse a precision that a device would have to emulate.
 
     Raises:
-        ValueError: the device does not do it natively.
+        NotNativeError: the device does not do it natively.
     """
     if not is_native(precision, device):
-        raise InputError(
+        raise NotNativeError(
             f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
             "backbone_precision=auto, which is float32 here, or float32; a feature set or checkpoint that was made in "
             f"{precision} runs with --policy.backbone_precision=float32, which logs how far the features drift."
