@@ -12,7 +12,7 @@ from scipy.stats import permutation_test
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 
-DRAWS = 4000
+DRAWS = 20_000
 PERMUTATIONS = 9999
 """Random ones, where there are more: p is then 0.0001 or more, which Holm multiplies by the number of comparisons."""
 
@@ -20,20 +20,21 @@ PERMUTATIONS = 9999
 def mean_rate(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate:
     """Mean over seeds of the share of episodes that succeeded, with an interval over seeds.
 
-    The interval is that of the Bayesian bootstrap (Rubin 1981) with one seed added at 0 and one at 1, widened to hold
-    the mean. For all-or-nothing seeds that is Beta(met + 1, seeds - met + 1), the posterior of `probability_better`.
-    Not `scipy.stats.bootstrap`, whose interval of ten equal seeds has no width; nor is there one of the deviation,
-    whose bounds would be those of the two added seeds.
+    The interval is Gaffke's (2005), for means of numbers between two bounds: quantiles of the mean under weights drawn
+    from a flat Dirichlet distribution over the seeds and one more, which is at 0 for the lower end and at 1 for the
+    upper. Seeds that succeed always or never have Clopper and Pearson's interval, and no distribution is known of
+    which it covers less than `level` (Learned-Miller and Thomas 2020). A bootstrap covers less where seeds nearly
+    always succeed, and of ten equal seeds its interval has no width.
 
     Args:
         rates: share in [0, 1] of each seed, (seeds,).
-        rng: source of the posterior draws.
-        level: of the credible interval.
+        rng: source of the weights.
+        level: of the interval.
     """
-    mean, values = float(np.mean(rates)), np.array([*rates, 0.0, 1.0])
-    draws = rng.dirichlet(np.ones(len(values)), size=DRAWS) @ values
-    low, high = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2])
-    return Estimate(mean, min(float(low), mean), max(float(high), mean))
+    weights, tail = rng.dirichlet(np.ones(len(rates) + 1), size=DRAWS), (1 - level) / 2
+    low = np.quantile(weights @ np.array([*rates, 0.0]), tail)
+    high = np.quantile(weights @ np.array([*rates, 1.0]), 1 - tail)
+    return Estimate(float(np.mean(rates)), float(low), min(float(high), 1.0))
 
 
 def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
