@@ -38,15 +38,24 @@ class ConstructSkillBenchmark(StepBenchmark):
         seed: seed of the first episode of every task.
         max_steps: horizon of every task; each task's own by default.
         perturb: `axis=level` with commas between, as `--env.perturb` takes it.
+        light_robot: as `--env.light_robot`: which robot is drawn; a model's training data say which it has seen.
     """
 
     render_backends: ClassVar[frozenset[str]] = frozenset({"gpu", "cpu"})
     _render_backend: ClassVar[str] = "auto"
 
-    def __init__(self, tasks: str = "bins", seed: int = 1000, max_steps: int | None = None, perturb: str = ""):
+    def __init__(
+        self,
+        tasks: str = "bins",
+        seed: int = 1000,
+        max_steps: int | None = None,
+        perturb: str = "",
+        light_robot: bool | None = None,
+    ):
         super().__init__()
         self._rows = [(suite, row) for suite, rows in select_tasks(tasks).items() for row in rows]
         self._seed, self._max_steps, self._perturb = seed, max_steps, perturb
+        self._light_robot = light_robot
         self._env: ConstructSkillEnv | None = None
 
     @classmethod
@@ -72,6 +81,7 @@ class ConstructSkillBenchmark(StepBenchmark):
                 task["name"],
                 OBS_TYPE,
                 self._max_steps,
+                self._light_robot,
                 render_backend=self._render_backend,
                 perturb=self._perturb,
             )

@@ -1,13 +1,16 @@
 """Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dataset.frames import packet_times
-from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, plural
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -101,16 +104,37 @@ def _check_videos(dataset: "LeRobotDataset") -> None:
             raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, but its episodes have {wanted}.")
 
 
-def choose_held_out(dataset: "LeRobotDataset", episodes: list[int] | None) -> list[int]:
-    """The episodes that were named, or those that the contract holds out.
+def choose_held_out(
+    dataset: "LeRobotDataset", episodes: list[int] | None, checkpoints: Iterable[Path | str]
+) -> list[int]:
+    """The episodes that were named, or those that the contract holds out, if no checkpoint was trained on them.
 
     Raises:
-        InputError: there are none, or the data set has not all of them.
+        InputError: there are none, the data set has not all of them, or a checkpoint has seen one that nobody named.
     """
     chosen = held_out(dataset.num_episodes) if episodes is None else episodes
     if not chosen or not set(chosen) <= set(range(dataset.num_episodes)):
         raise InputError(f"Held-out episodes must be among 0 to {dataset.num_episodes - 1}, not {chosen}.")
+    for checkpoint in checkpoints if episodes is None else ():
+        if seen := sorted(trained_on(Path(checkpoint), dataset) & set(chosen)):
+            raise InputError(
+                f"'{checkpoint}' was trained on {plural(len(seen), 'episode')} of those that are held out by default, "
+                f"episode {seen[0]} for one: name others by --episodes, or the same to see their error all the same."
+            )
     return chosen
+
+
+def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int]:
+    """The episodes of a data set that a checkpoint of `lerobot-train` says it was trained on; none if it says nothing.
+
+    LeRobot keeps the last of those that it was given for its own evaluation, a share `eval_split` rounded up.
+    """
+    path = checkpoint / TRAIN_CONFIG
+    told = json.loads(path.read_text()).get("dataset", {}) if path.is_file() else {}
+    if told.get("repo_id") != dataset.repo_id:
+        return set()
+    given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
+    return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
 
 
 @contextmanager

@@ -19,6 +19,7 @@ class EncodeConfig:
 
     repo_id: RepoId  # the data set to encode
     root: Path | None = None  # its folder; default: LeRobot's cache
+    revision: Text | None = None  # tag, branch or commit on the Hub
     out_repo_id: RepoId | None = None  # default: <repo_id>_<backbone>
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # an entry of `backbones.BACKBONES`, timm/<model>, or hf/<owner>/<name>
@@ -63,7 +64,7 @@ def encode(config: EncodeConfig) -> Path:
         encoder, info = load_encoder(
             config.backbone, config.backbone_path, config.backbone_precision, config.crop, device
         )
-        dataset = open_lerobot(config.repo_id, config.root)
+        dataset = open_lerobot(config.repo_id, config.root, config.revision)
         write_feature_set(
             dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches
         )

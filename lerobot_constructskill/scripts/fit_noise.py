@@ -19,6 +19,7 @@ class FitNoiseConfig:
     repo_id: RepoId  # the demonstrations, with their images and phases
     out: Path  # YAML to write, for constructskill-generate
     root: Path | None = None  # the demonstrations' folder; default: LeRobot's cache
+    revision: Text | None = None  # tag, branch or commit on the Hub
     episodes: Episodes | None = None  # held-out episodes; default: every eighth
     alpha: Alpha | None = None  # scale to this sum of squared errors per episode, in m2; default: as measured
     device: Device | None = None  # default: a GPU if there is one
@@ -49,9 +50,9 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot_constructskill.rollout.agents import PolicyAgent
     from lerobot_constructskill.rollout.offline import check_actions, shown
 
-    dataset = open_lerobot(config.repo_id, config.root)
+    dataset = open_lerobot(config.repo_id, config.root, config.revision)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
-    episodes = choose_held_out(dataset, config.episodes)
+    episodes = choose_held_out(dataset, config.episodes, [config.policy_path])
     with one_sentence(config.policy_path):
         device = config.device or str(auto_select_torch_device())
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)

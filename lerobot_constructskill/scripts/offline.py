@@ -63,7 +63,7 @@ def evaluate_offline(config: OfflineConfig) -> str:
 
     checkpoints = _find(config.policies)
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
-    episodes = choose_held_out(dataset, config.episodes)
+    episodes = choose_held_out(dataset, config.episodes, checkpoints)
     source = {
         "episodes": ",".join(map(str, episodes)),
         "dataset": config.repo_id,

@@ -44,7 +44,7 @@ LIFT_HEIGHT = 0.15
 """Height in metres that the object's centre must reach to count as lifted (paper, section III)."""
 
 RIM_ALLOWANCE = 0.025
-"""Added in metres to half the bin's height, so that an object resting on the rim counts (paper, section III)."""
+"""Added in metres to half the bin's height, so that an object resting against the rim counts (paper, section III)."""
 
 FINGER_OPEN = 0.038
 """Position in metres at which a finger counts as open; its limit is 0.04, a held brick keeps it at 0.0325."""

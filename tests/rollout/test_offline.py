@@ -2,7 +2,8 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from contextlib import nullcontext
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,9 @@ import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_constructskill.dataset import hub
 from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict, shown
@@ -156,6 +159,28 @@ def test_features_of_another_encoder_are_not_scored(checkpoint, feature_set, tmp
     with pytest.raises(InputError, match="not made by this policy's encoder: weights_sha256 0000"):
         evaluate_offline(OfflineConfig([str(checkpoint)], "local/random", other, episodes=EPISODES, out=tmp_path))
     assert not (tmp_path / "offline.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("told", "seen"),
+    [
+        ({}, "2 episodes of those that are held out by default, episode 3 for one"),
+        ({"eval_split": 0.125}, "1 episode of those that are held out by default, episode 3"),
+        ({"episodes": [0, 1, 2, 4, 5, 6, 3, 7], "eval_split": 0.25}, None),
+        ({"episodes": [0, 1, 2]}, None),
+        ({"repo_id": "local/another"}, None),
+    ],
+    ids=str,
+)
+def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint, feature_set, tmp_path, monkeypatch):
+    """Not by default: whoever names an episode may have a reason."""
+    monkeypatch.setattr(hub, "held_out", lambda episodes: EPISODES)  # every fourth of eight
+    trained = shutil.copytree(checkpoint, tmp_path / "checkpoint")
+    (trained / TRAIN_CONFIG).write_text(json.dumps({"dataset": {"repo_id": "local/random"} | told}))
+    asked = OfflineConfig([str(trained)], "local/random", feature_set.root, out=tmp_path)
+    with pytest.raises(InputError, match=seen) if seen else nullcontext():
+        evaluate_offline(asked)
+    evaluate_offline(replace(asked, episodes=EPISODES))
 
 
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):

@@ -95,7 +95,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             about 3e-3 m) relative to the gripper's. It matters only with a readout that learns, because both heads
             then share its parameters.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
-            None keeps it constant, as the paper does.
+            None keeps it constant.
     """
 
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"

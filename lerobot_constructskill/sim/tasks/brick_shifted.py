@@ -1,4 +1,4 @@
-"""Brick to bin with the brick's position randomised: the paper's first next step."""
+"""Brick to bin with the brick's position randomised: one of the extensions that the paper plans."""
 
 from mani_skill.utils.registration import register_env
 
