@@ -22,8 +22,7 @@ def make_env(
 
     Args:
         n_envs: environments in each vector environment.
-        use_async_envs: a process for each of them. LeRobot then starts an environment whose episode has ended again on
-            `reset(options={"lerobot_new_rollout": True})` alone.
+        use_async_envs: a process for each of them.
         cfg: its `task`, where it has one, chooses the tasks as `--env.task` does.
     """
     task = (cfg and cfg.task) or ",".join(SUITES)

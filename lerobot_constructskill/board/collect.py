@@ -87,9 +87,9 @@ def _alike(
         raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(study)}.")
     asked = [setting.where for setting in settings.values()]
     alike: dict[tuple, list[str]] = {}
-    ran = [name for name in ran if name in study]
+    ran = [name for name in ran if name in study and name in (chosen or study)]
     for name in ran:
-        if study[name] in asked and name in (chosen or study):
+        if study[name] in asked:
             alike.setdefault(study[name], []).append(name)
     if not alike:
         raise InputError(
@@ -98,7 +98,7 @@ def _alike(
     if several := [names for names in alike.values() if len(names) > 1]:
         raise InputError(
             f"{' and '.join(several[0])} of the study evaluate alike: say whose runs are meant, such as "
-            f"--study_settings=[{several[0][-1]}]."
+            f"--study_settings=[{','.join(names[-1] for names in alike.values())}]."
         )
     return [name for (name,) in alike.values()]
 

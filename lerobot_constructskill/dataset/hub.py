@@ -125,16 +125,24 @@ def choose_held_out(
 
 
 def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int]:
-    """The episodes of a data set that a checkpoint of `lerobot-train` says it was trained on; none if it says nothing.
+    """The episodes of a data set that a checkpoint in a folder says it was trained on, or on their features.
 
-    LeRobot keeps the last of those that it was given for its own evaluation, a share `eval_split` rounded up.
+    None if `lerobot-train` did not make it. Of those that it is given LeRobot keeps the last for its own evaluation, a
+    share `eval_split` rounded up.
     """
     path = checkpoint / TRAIN_CONFIG
     told = json.loads(path.read_text()).get("dataset", {}) if path.is_file() else {}
-    if told.get("repo_id") != dataset.repo_id:
+    if dataset.repo_id not in (told.get("repo_id"), *_sources(told.get("root"))):
         return set()
     given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
     return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
+
+
+def _sources(root: str | None) -> set[str]:
+    """Of which data sets a feature set that lies in a folder holds the features."""
+    path = Path(root or "") / "meta" / "info.json"
+    features = json.loads(path.read_text())["features"] if path.is_file() else {}
+    return {info["source_repo_id"] for of in features.values() if "source_repo_id" in (info := of.get("info") or {})}
 
 
 @contextmanager

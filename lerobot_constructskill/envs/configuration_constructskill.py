@@ -11,11 +11,10 @@ from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
-from lerobot_constructskill.envs.freeze import frozen_at_end
+from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, frozen_at_end
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
-from lerobot_constructskill.lerobot_internals import _LazyAsyncVectorEnv
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
@@ -102,7 +101,7 @@ class ConstructSkillEnvConfig(EnvConfig):
             # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.
             multiprocessing.set_forkserver_preload(["lerobot.envs.utils", "lerobot_constructskill.sim.register"])
             probe = self._make_env(task)
-            return _LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
+            return LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
         return gym.vector.SyncVectorEnv(
             [partial(frozen_at_end, fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
         )

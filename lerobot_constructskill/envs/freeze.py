@@ -5,7 +5,11 @@ from typing import Any
 
 import gymnasium as gym
 
-from lerobot_constructskill.lerobot_internals import NEW_ROLLOUT_OPTION, FreezeAfterEpisodeEnd
+from lerobot_constructskill.lerobot_internals import (
+    NEW_ROLLOUT_OPTION,
+    FreezeAfterEpisodeEnd,
+    _LazyAsyncVectorEnv,
+)
 
 
 class FrozenAtEnd(FreezeAfterEpisodeEnd):
@@ -16,9 +20,19 @@ class FrozenAtEnd(FreezeAfterEpisodeEnd):
     """
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
-        if given:
-            given["options"] = (given.get("options") or {}) | {NEW_ROLLOUT_OPTION: True}
-        return super().reset(**given)
+        return super().reset(**thawing(**given) if given else {})
+
+
+class LazyAsyncVectorEnv(_LazyAsyncVectorEnv):
+    """LeRobot's, whose workers freeze by themselves, thawed by every `reset` too."""
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        return super().reset(**thawing(**given))
+
+
+def thawing(seed: Any = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
+    """What a `reset` is given, with LeRobot's own word that an episode is to begin."""
+    return {"seed": seed, "options": (options or {}) | {NEW_ROLLOUT_OPTION: True}}
 
 
 def frozen_at_end(make: Callable[[], gym.Env]) -> gym.Env:

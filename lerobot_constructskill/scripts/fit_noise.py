@@ -20,7 +20,7 @@ class FitNoiseConfig:
     out: Path  # YAML to write, for constructskill-generate
     root: Path | None = None  # the demonstrations' folder; default: LeRobot's cache
     revision: Text | None = None  # tag, branch or commit on the Hub
-    episodes: Episodes | None = None  # held-out episodes; default: every eighth
+    episodes: Episodes | None = None  # held-out episodes; default: every eighth, refused if trained on
     alpha: Alpha | None = None  # scale to this sum of squared errors per episode, in m2; default: as measured
     device: Device | None = None  # default: a GPU if there is one
     backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's

@@ -25,7 +25,7 @@ class OfflineConfig:
     repo_id: RepoId  # the demonstrations
     root: Path | None = None  # their folder; default: LeRobot's cache, or the Hub
     revision: Text | None = None  # tag, branch or commit on the Hub
-    episodes: Episodes | None = None  # held-out demonstrations; default: every eighth
+    episodes: Episodes | None = None  # held-out demonstrations; default: every eighth, refused if trained on
     out: Path = Path("outputs/offline")  # folder for offline.json and offline.parquet
     batch_size: BatchSize = 32  # frames at a time
     seed: Seed = 0  # of policies that sample their actions

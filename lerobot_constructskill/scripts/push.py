@@ -1,5 +1,6 @@
 """`constructskill-push`: check a data set and upload it to the Hub."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from lerobot_constructskill.scripts.console import run
 class PushConfig:
     """Check a data set, write its card, upload it to the Hub as one commit and tag it.
 
-    A card that somebody changed stays as it is; one that was generated under another name gets this one.
+    A card that somebody changed, or another version wrote, stays as it is; others get this name.
 
     After an interruption the same command continues.
     """
@@ -51,7 +52,9 @@ def push_dataset(config: PushConfig) -> str:
             f"{config.root} is not pushed, because the checks found {plural(len(wrong), 'fault')}; {wrong[0]}"
         )
     card = config.root / "README.md"
-    if not card.is_file() or card.read_text() == render(card_facts(data)):
+    text = card.read_text() if card.is_file() else ""
+    named = re.search(r"^# (\S+/\S+)$", text, re.MULTILINE)
+    if not text or (named and text == render(card_facts(data) | {"repo_id": named[1]})):
         print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"
 

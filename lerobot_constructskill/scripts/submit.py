@@ -35,6 +35,8 @@ class SubmitConfig:
         check(self)
         if (self.recorded is None) == (self.study is None) or (self.study is None) != (self.variant is None):
             raise InputError("Give what the submission is made from: --recorded, or --study with --variant.")
+        if self.study_settings and self.study is None:
+            raise InputError("study_settings are of --study.")
         if bad := [seed for seed in self.failures if not (seed.isdecimal() and len(seed) < 10)]:
             raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
 

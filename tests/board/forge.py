@@ -407,3 +407,22 @@ def actions_after_the_end(root, rng):
         row["actions"] = [*row["actions"], 0.0, 0.0, 0.0, 1.0]
 
     edit(root, change)
+
+
+@forges(REPLAYED)
+def an_easier_setting(root, rng):
+    """Played with the task as it is, and called perturbed, beside its control."""
+
+    def change(said):
+        said["settings"]["moved"] = said["settings"]["brick_to_bin_shifted"] | {"perturb": "pose=3"}
+
+    def play(rows):
+        placed = [row for row in rows if row["setting"] == "brick_to_bin_shifted" and row["placed"]]
+        for seed in (0, 1):  # another's actions would be refused as a copy
+            rows += [row | {"setting": "moved", "training_seed": seed, "actions": nudged(row, seed)} for row in placed]
+
+    def nudged(row, seed):
+        return [row["actions"][0] + 1e-4 * seed, *row["actions"][1:]]
+
+    declare(root, change)
+    edit(root, play)

@@ -51,7 +51,7 @@ def test_what_is_wrong_with_it_is_seen_when_it_is_replayed(valid, tmp_path):
     for kind, forge in REPLAYED.items():
         for number in range(TIMES_REPLAYED):
             submission = read_submission(forged(valid, tmp_path / kind, forge, number))
-            changed = [claim for claim in submission.claims if is_other(claim, before[claim.key])]
+            changed = [claim for claim in submission.claims if is_other(claim, before.get(claim.key))]
             for claim in changed or submission.claims[:1]:
                 setting = submission.declaration.settings[claim.setting]
                 env = envs.setdefault(repr(setting), open_simulator(setting))
@@ -62,4 +62,4 @@ def test_what_is_wrong_with_it_is_seen_when_it_is_replayed(valid, tmp_path):
 
 
 def is_other(one, other):
-    return one.outcome != other.outcome or not np.array_equal(one.actions, other.actions)
+    return other is None or one.outcome != other.outcome or not np.array_equal(one.actions, other.actions)

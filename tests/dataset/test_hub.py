@@ -95,7 +95,7 @@ def refusal(call, *arguments, **options):
 
 
 def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy):
-    write_card(CardConfig(copy))  # as generation does, under the name that it was given
+    write_card(CardConfig(copy, "bob/before"))  # as a push under another name does
     url = machine(push_dataset, PushConfig("alice/toy", copy, private=True, tag="v1.0"))
     repo = hub.repos["datasets/alice/toy"]
     assert repo.private and set(repo.tags) == {"v3.0", "v1.0"} and repo.branches["main"] in url

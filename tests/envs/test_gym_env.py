@@ -255,7 +255,7 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs):
             after, reward, *_ = vector.step(np.stack([HOVER, HOVER]))
             np.testing.assert_array_equal(after["agent_pos"], frozen["agent_pos"])
             assert (reward == 0).all()
-        again, _ = vector.reset(seed=[7, 8], options=NEW_ROLLOUT if use_async_envs else None)
+        again, _ = vector.reset(seed=[7, 8])
         np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
     finally:
         vector.close()

@@ -183,6 +183,23 @@ def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint
     evaluate_offline(replace(asked, episodes=EPISODES))
 
 
+def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_path):
+    (tmp_path / "features" / "meta").mkdir(parents=True)
+    column = {"info": {"source_repo_id": "alice/set"}}
+    described = {"features": {"observation.features.base": column, "action": {"info": None}, "index": {}}}
+    (tmp_path / "features" / "meta" / "info.json").write_text(json.dumps(described))
+    told = {
+        "repo_id": "alice/set_encoded",
+        "root": str(tmp_path / "features"),
+        "episodes": [2, 0, 1],
+        "eval_split": 0.3,
+    }
+    (tmp_path / TRAIN_CONFIG).write_text(json.dumps({"dataset": told}))
+    for repo_id, episodes in (("alice/set", {0, 2}), ("alice/set_encoded", {0, 2}), ("alice/other", set())):
+        assert hub.trained_on(tmp_path, SimpleNamespace(repo_id=repo_id, num_episodes=4)) == episodes
+    assert not hub.trained_on(tmp_path / "nothing", SimpleNamespace(repo_id="alice/set", num_episodes=4))
+
+
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
     with pytest.raises(FileNotFoundError, match="matches no checkpoint"):
         evaluate_offline(OfflineConfig([str(tmp_path / "none")], "local/random", feature_set.root))
