@@ -1,6 +1,6 @@
 """How each stage grows with the number of demonstrations: seconds for each further one, and peak memory.
 
-Generation is measured on real demonstrations, few of them, and merging on copies of one, half a second each. Encoding
+Generation is measured on real demonstrations, few of them, and merging on copies of one. Encoding
 and training are measured on up to 1280, short ones of random colours, with the small encoder and random weights.
 What is measured is how the cost grows, not what it is.
 """
