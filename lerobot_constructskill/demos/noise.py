@@ -66,13 +66,6 @@ class NoiseConfig:
         return vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
 
 
-@dataclass(frozen=True)
-class NoNoise(NoiseConfig):
-    """`NoiseConfig` where nothing is perturbed unless that is asked for."""
-
-    sigma: Sigma = 0.0
-
-
 def _check_covariance(covariance: list[list[float]]) -> None:
     matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
     if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):

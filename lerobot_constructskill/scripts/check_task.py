@@ -8,9 +8,9 @@ from pathlib import Path
 from lerobot_constructskill.bounds import Count, check
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig
-from lerobot_constructskill.demos.noise import NoNoise
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.no_noise import NoNoise
 
 TILE = 224
 """Height and width of a picture in the contact sheet, in pixels."""

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
-from lerobot_constructskill.demos.noise import NoNoise
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.no_noise import NoNoise
 
 View = Annotated[str, Among(("close", "policy"))]
 
