@@ -149,7 +149,7 @@ system_is_ready() {
     [[ -z "$(missing_packages "${PACKAGES[@]}")" ]] && new_enough "$(installed_version mesa-vulkan-drivers)"
 }
 
-# An image may come without apt's lists; what it could install then is what it has.
+# Without apt's lists, as in many images, apt knows of nothing newer than what is installed.
 knows_of_packages() { compgen -G "${1:-}/var/lib/apt/lists/*_Packages*" >/dev/null; }
 
 # All is installed, but Mesa is old, and apt has no newer one (Ubuntu 22.04).

@@ -72,7 +72,7 @@ def largest_rewards(eval_info: dict[str, Any]) -> list[float]:
 
 
 @contextmanager
-def replaced(name: str, ours: Callable) -> Iterator[None]:
+def patched(name: str, ours: Callable) -> Iterator[None]:
     """In its block LeRobot calls `ours` where it would call one of `NAMES`."""
     theirs, owner = __getattr__(name), import_module(NAMES[name])
     setattr(owner, name, ours)

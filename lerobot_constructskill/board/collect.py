@@ -13,9 +13,6 @@ from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_re
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_rows
 
-PLACE = {"task", "episode_length", "perturb", "perturb_seed"}
-"""Arguments of an environment by which `where` tells it from others."""
-
 SEED = r"seed_(\d{1,9})"
 
 type Piles = dict[int, list[Recording]]
@@ -107,8 +104,10 @@ def _environments(path: Path) -> dict[str, tuple[str, int, str]]:
     """Where each of a study's settings evaluates, as `Setting.where`."""
     try:
         settings = yaml.safe_load(path.read_text())["settings"]
+        envs = {name: of["env"] for name, of in settings.items()}
         return {
-            name: where(**{one: of["env"][one] for one in PLACE & of["env"].keys()}) for name, of in settings.items()
+            name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
+            for name, env in envs.items()
         }
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         raise InputError(f"'{path}' is not a study's file, or a setting in it does not say env.task.") from None

@@ -147,8 +147,7 @@ def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     alike: dict[tuple, dict[str, Estimate]] = {}
     for entry in entries:
         if entry.is_ranked and setting in entry.standings:
-            evaluated = entry.said.settings[setting]
-            placed = alike.setdefault((*evaluated.where, evaluated.starts), {})
+            placed = alike.setdefault(entry.said.settings[setting].compared, {})
             placed[entry.name] = entry.standings[setting].placed
     found = {}
     for placed in alike.values():

@@ -99,6 +99,11 @@ class Setting:
         """What its episodes have in common, as `where` says it."""
         return where(self.task, self.episode_length, self.perturb, self.perturb_seed)
 
+    @property
+    def compared(self) -> tuple:
+        """Equal for settings whose results can be compared: they are the same but for their names."""
+        return *self.where, self.starts
+
 
 def where(
     task: str, episode_length: int | None = None, perturb: str = "", perturb_seed: int = 0

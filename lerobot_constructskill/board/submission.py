@@ -133,14 +133,11 @@ class Declaration:
             check_line(number, "versions")
 
     def _check_setting(self, name: str, setting: Setting) -> None:
-        named = SUITES[self.suite].settings.get(name)
-        task = named.task if named else name if name in TASKS else setting.task
-        if setting.task != task:
+        called = {task: task for task in TASKS} | {one: of.task for one, of in SUITES[self.suite].settings.items()}
+        if setting.task != (task := called.get(name, setting.task)):
             raise InputError(f"The setting {name} must be of the task {task}, or have another name than it.")
-        control = replace(setting, perturb="", perturb_seed=0)
-        if setting.perturbation and not any(
-            (one.where, one.starts) == (control.where, control.starts) for one in self.settings.values()
-        ):
+        control = replace(setting, perturb="", perturb_seed=0).compared
+        if setting.perturbation and control not in [one.compared for one in self.settings.values()]:
             raise InputError(
                 f"The setting {name} must have its control beside it: a setting of the same task, length and starts "
                 "without a perturbation."

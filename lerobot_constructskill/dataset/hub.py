@@ -142,7 +142,8 @@ def _sources(root: str | None) -> set[str]:
     """Of which data sets a feature set that lies in a folder holds the features."""
     path = Path(root or "") / "meta" / "info.json"
     features = json.loads(path.read_text())["features"] if path.is_file() else {}
-    return {info["source_repo_id"] for of in features.values() if "source_repo_id" in (info := of.get("info") or {})}
+    infos = [feature.get("info") or {} for feature in features.values()]
+    return {info["source_repo_id"] for info in infos if "source_repo_id" in info}
 
 
 @contextmanager

@@ -63,9 +63,9 @@ def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> N
     """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
     from lerobot.datasets import aggregate_datasets
 
-    from lerobot_constructskill.lerobot_internals import replaced
+    from lerobot_constructskill.lerobot_internals import patched
 
-    with replaced("load_episodes", kept_of_episodes):  # of each of them
+    with patched("load_episodes", kept_of_episodes):  # of each of them
         while len(roots) > GROUP:
             groups = list(batched(roots, GROUP))
             scratch = scratch / "groups"

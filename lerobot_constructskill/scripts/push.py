@@ -54,7 +54,8 @@ def push_dataset(config: PushConfig) -> str:
     card = config.root / "README.md"
     text = card.read_text() if card.is_file() else ""
     named = re.search(r"^# (\S+/\S+)$", text, re.MULTILINE)
-    if not text or (named and text == render(card_facts(data) | {"repo_id": named[1]})):
+    is_anothers = named and named[1] != config.repo_id
+    if not text or (is_anothers and text == render(card_facts(data) | {"repo_id": named[1]})):
         print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"
 

@@ -23,8 +23,8 @@ def mean_rate(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) 
     The interval is Gaffke's (2005), for means of numbers between two bounds: quantiles of the mean under weights drawn
     from a flat Dirichlet distribution over the seeds and one more, which is at 0 for the lower end and at 1 for the
     upper. Seeds that succeed always or never have Clopper and Pearson's interval, and no distribution is known of
-    which it covers less than `level` (Learned-Miller and Thomas 2020). A bootstrap covers less where seeds nearly
-    always succeed, and of ten equal seeds its interval has no width.
+    which it covers less than `level` (Learned-Miller and Thomas, arXiv:1905.06208, who conjecture that there is none).
+    A bootstrap covers less where seeds nearly always succeed, and of ten equal seeds its interval has no width.
 
     Args:
         rates: share in [0, 1] of each seed, (seeds,).

@@ -72,9 +72,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             self._load_backbone()
         self._check_column(config.backbone_sha256)
         self.readout = READOUTS[config.readout]
-        self.patches_root = dataset_meta.root if dataset_meta is not None else None
-        if config.feature_column is not None and self.readout.reads_patches:
-            open_patches(self.patches_root)
+        self._find_patches(dataset_meta.root if dataset_meta is not None else None)
         self.heads = self.fresh_heads()
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
@@ -209,6 +207,12 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             made_by = describe(spec, sha256, config.backbone_trained_precision, config.crop, config.blind)
             check_features(config.feature_column, made_by, spec.feature_dim)
 
+    def _find_patches(self, root: Path | None) -> None:
+        """Know where a data set's patch features lie, and that they are there if they are to be read."""
+        self.patches_root = root
+        if self.config.feature_column is not None and self.readout.reads_patches:
+            open_patches(root)
+
     def _log_crossing(self, image: Tensor) -> None:
         precision, trained = self.config.backbone_precision, self.config.backbone_trained_precision
         if precision != trained:
@@ -270,12 +274,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             FileNotFoundError: it lacks the patch features that the readout takes.
         """
         self.config.set_dataset_feature_metadata(meta.features)
-        if self.config.feature_column is None:
-            return
         self._check_column(self.config.backbone_sha256)
-        self.patches_root = meta.root
-        if self.readout.reads_patches:
-            open_patches(meta.root)
+        self._find_patches(meta.root)
 
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
