@@ -22,14 +22,12 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-@pytest.fixture(scope="module")
-def by_pytorch():
+@pytest.fixture
+def by_pytorch(monkeypatch):
     """PyTorch encodes: OpenVINO compiles each policy's backbone for three seconds. test_backbones.py compares them."""
     from lerobot_constructskill.policies.frozen_vit import openvino
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(openvino, "is_installed", lambda: False)
-        yield
+    monkeypatch.setattr(openvino, "is_installed", lambda: False)
 
 
 def find_chromium() -> str | None:
