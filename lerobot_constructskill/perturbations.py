@@ -34,6 +34,9 @@ AXES = {
     "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16)),
 }
 
+PICTURES = ("light", "texture", "sensor")
+"""Axes that change every picture of every camera, and nothing that moves."""
+
 
 @dataclass(frozen=True)
 class Perturbation:
@@ -77,6 +80,11 @@ class Perturbation:
         """The number of the level at which `axis` is perturbed, in the axis's unit; 0 where it is not."""
         level = self._level(axis)
         return AXES[axis].levels[level - 1] if level else 0.0
+
+    @property
+    def pictures(self) -> tuple[float, ...]:
+        """What is changed in all pictures and in nothing else."""
+        return tuple(self.amount(axis) for axis in PICTURES)
 
     @property
     def label(self) -> str:

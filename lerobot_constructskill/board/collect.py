@@ -137,6 +137,10 @@ def submit(
             used += [one for start in setting.starts for one in found.get(start, [])]
     if not used:
         raise InputError("Nothing was recorded.")
+    if about.observes == "pixels_agent_pos" and "pixels" in {one.obs_type for one in used}:
+        raise InputError(
+            "about.observes is pixels_agent_pos, but the policy was shown pixels: it can observe no more."
+        )
     return write_submission(
         root,
         claims,

@@ -129,7 +129,7 @@ def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
     try:
         verdict = {"machines": []} | json.loads(path.read_text())  # before 2026-11-24 none was named
         known = verdict["level"] in LEVELS and isinstance(verdict["versions"], dict)
-        known = known and isinstance(verdict["machines"], list)
+        known = known and isinstance(verdict["machines"], list) and isinstance(verdict["date"], str)
     except (ValueError, KeyError, TypeError):
         known = False
     if not known:

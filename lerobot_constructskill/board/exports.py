@@ -119,7 +119,7 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
             "overall_score": None,
             "task_scores": {name: round(100 * one.placed.value, 2) for name, one in entry.standings.items()},
             "curated_by": "constructskill-api",
-            "date_added": day,
+            "date_added": entry.verdict["date"],
             "notes": f"{len(entry.said.training_seeds)} training seeds; {entry.level} by constructskill-verify.",
         }
         for entry in entries

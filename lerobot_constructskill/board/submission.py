@@ -21,7 +21,7 @@ from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.board.protocol import PHYSICS, SUITES, Setting, class_of
 from lerobot_constructskill.board.strangers import bounded_memory, make, read_files, read_yaml
 from lerobot_constructskill.bounds import Among, NotEmpty, Pattern, Seed, check
-from lerobot_constructskill.contract import STAGES, TASKS, get_task
+from lerobot_constructskill.contract import OBS_TYPES, STAGES, TASKS, get_task
 from lerobot_constructskill.envs.actions import within_reach
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
 from lerobot_constructskill.errors import InputError, first_line, plural
@@ -133,9 +133,11 @@ class Declaration:
             check_line(number, "versions")
 
     def _check_setting(self, name: str, setting: Setting) -> None:
-        called = {task: task for task in TASKS} | {one: of.task for one, of in SUITES[self.suite].settings.items()}
-        if setting.task != (task := called.get(name, setting.task)):
-            raise InputError(f"The setting {name} must be of the task {task}, or have another name than it.")
+        called = {task: (task, setting.perturbation) for task in TASKS}
+        called |= {one: (of.task, of.perturbation) for one, of in SUITES[self.suite].settings.items()}
+        own = setting.task, setting.perturbation
+        if own != (meant := called.get(name, own)):
+            raise InputError(f"The setting {name} must be of the task {''.join(meant)}, or have another name than it.")
         control = replace(setting, perturb="", perturb_seed=0).compared
         if setting.perturbation and control not in [one.compared for one in self.settings.values()]:
             raise InputError(
@@ -356,18 +358,21 @@ def _check(claim: Claim, setting: Setting) -> None:
 
 
 def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:
-    """Two trainings of one policy never place with the same actions to the last bit, as they are executed."""
-    if declaration.about.observes == "nothing":
+    """Two trainings never place with the same actions to the last bit, as they are executed; nor does one that sees
+    other pictures. A reference sees none.
+    """
+    if declaration.about.observes not in OBS_TYPES:
         return
+    pictures = {name: setting.pictures for name, setting in declaration.settings.items()}
     first: dict[tuple, Claim] = {}
     for claim in claims:
         if claim.placed:
-            names = get_task(declaration.settings[claim.setting].task).action_names
+            task = declaration.settings[claim.setting].task
+            names = get_task(task).action_names
             executed = within_reach(claim.actions.reshape(-1, len(names)), names) + 0.0  # -0.0 is 0.0
-            same = claim.setting, claim.evaluation_seed, executed.tobytes()
-            other = first.setdefault(same, claim)
-            if other is not claim:
-                raise InputError(f"{claim.where} has exactly the actions of training seed {other.training_seed}.")
+            other = first.setdefault((task, claim.evaluation_seed, executed.tobytes()), claim)
+            if claim.training_seed != other.training_seed or pictures[claim.setting] != pictures[other.setting]:
+                raise InputError(f"{claim.where} has exactly the actions of {other.where}.")
 
 
 def is_replayable(declaration: Declaration) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from lerobot_constructskill.bounds import Count, Text, Workers, check
@@ -32,6 +33,10 @@ class VerifyConfig:
         check(self)
         if self.rerun is not None and self.value is None:
             raise InputError("--rerun needs --value, the public random number that its starts come from.")
+        if self.value is not None and self.rerun is None and (self.record, self.sample) != (None, None):
+            raise InputError(
+                "--value alone replays nothing: give --record or --sample with --rerun, or without --value."
+            )
         if self.record is not None and self.sample is not None:
             raise InputError("A verdict is about all episodes: --record cannot be combined with --sample.")
 
@@ -49,14 +54,17 @@ def verify(config: VerifyConfig) -> str:
     submission = read_submission(config.root)
     if config.value is not None and config.rerun is None:
         return _tell_rerun(submission, config.value)
+    rerun = _compared(submission, config) if config.rerun is not None else None
     verdict = _replayed(submission, config)
     told = (
         f"{config.root} holds: {verdict.replayed} of {len(submission.claims)} episodes replayed "
         f"({plural(verdict.steps, 'step')}), each ended as claimed; {verdict.failed} failed with an error."
     )
     facts = {"submission": submission.sha256, "level": "replayed", "versions": verdict.versions}
-    if config.rerun is not None:
-        comparison = _rerun(submission, config)
+    if rerun is not None:
+        again, comparison = rerun
+        _replayed(again, config)
+        comparison.confirm()
         told, facts = f"{told} {comparison.sentence}", facts | {"level": "re-run", "rerun": comparison.facts}
     if config.record is not None:
         _record(config.record / f"{config.root.resolve().name}.json", facts)
@@ -64,13 +72,14 @@ def verify(config: VerifyConfig) -> str:
 
 
 def _record(path: Path, facts: dict) -> None:
-    """Write what was found. What else is known of the submission stays: other machines that found it, and a re-run."""
+    """Write what was found. What else is known of the submission stays: the first date, other machines, a re-run."""
     from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.artifacts.processor import processor
     from lerobot_constructskill.board.entries import read_verdict
     from lerobot_constructskill.board.protocol import CLAIMED, LEVELS
 
     before = read_verdict(path, {"submission": facts["submission"]})
+    facts = {"date": before.get("date", datetime.now(UTC).date().isoformat())} | facts
     if LEVELS.index(before.get("level", CLAIMED)) > LEVELS.index(facts["level"]):
         facts = facts | {"level": before["level"], "rerun": before["rerun"]}
     earlier = before["machines"] if before.get("versions") == facts["versions"] else []
@@ -100,15 +109,13 @@ def _tell_rerun(submission, value: str) -> str:
     return instructions(submission, value)
 
 
-def _rerun(submission, config: VerifyConfig):
+def _compared(submission, config: VerifyConfig):
+    """The re-run and what it says of the submission, before either is replayed, which takes minutes."""
     from lerobot_constructskill.board.rerun import compare
     from lerobot_constructskill.board.submission import read_submission
 
     again = read_submission(config.rerun)
-    comparison = compare(submission, again, config.value)
-    _replayed(again, config)
-    comparison.confirm()
-    return comparison
+    return again, compare(submission, again, config.value)
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import yaml
 
 from lerobot_constructskill.board.submission import DECLARATION, EPISODES
+from lerobot_constructskill.perturbations import PICTURES
 
 type Forge = Callable[[Path, np.random.Generator], None]
 
@@ -65,6 +66,36 @@ def placed(rows: list[dict], rng: np.random.Generator) -> dict:
 def a_perturbed_setting_without_its_control(root, rng):
     """Played with the task as it is, and called perturbed."""
     declare(root, lambda said: said["settings"]["brick_to_bin_shifted"].update(perturb="pose=3"))
+
+
+@forges(READ)
+def a_control_called_perturbed(root, rng):
+    """Other light moves nothing, so that the control's actions end in it as they end in the control."""
+    axis = rng.choice(PICTURES)
+    declare(
+        root,
+        lambda said: said["settings"].update(
+            perturbed=said["settings"]["brick_to_bin_shifted"] | {"perturb": f"{axis}=2"}
+        ),
+    )
+    edit(
+        root,
+        lambda rows: rows.extend(
+            [row | {"setting": "perturbed"} for row in rows if row["setting"] == "brick_to_bin_shifted"]
+        ),
+    )
+
+
+@forges(READ)
+def a_task_called_perturbed(root, rng):
+    """The columns of the suite `perturbed` are its axes."""
+
+    def change(said):
+        said["suite"] = "perturbed"
+        said["settings"]["pose"] = said["settings"].pop("brick_to_bin_shifted")
+
+    declare(root, change)
+    edit(root, lambda rows: [row.update(setting="pose") for row in rows if row["setting"] == "brick_to_bin_shifted"])
 
 
 @forges(READ)

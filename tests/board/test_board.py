@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from datetime import UTC, datetime
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -132,7 +133,7 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     entry = read_entries(root)[0]
     (root / "verified").mkdir()
     path = root / "verified" / f"{entry.name}.json"
-    verdict = {"submission": entry.submission.sha256, "level": "replayed", "versions": {"sapien": "3"}}
+    verdict = {"submission": entry.submission.sha256, "level": "replayed", "versions": {"sapien": "3"}, "date": ""}
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
         assert read_entries(root)[0].level == level
@@ -154,6 +155,7 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
 def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
     path, versions = tmp_path / "entry.json", {"sapien": "3"}
     replayed = {"submission": "0" * 64, "level": "replayed", "versions": versions}
+    since = {"date": datetime.now(UTC).date().isoformat()}
     rerun = replayed | {"level": "re-run", "rerun": {"value": "beef"}}
 
     def recorded(machine, facts):
@@ -161,13 +163,15 @@ def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
         _record(path, facts)
         return json.loads(path.read_text())
 
-    assert recorded("A", replayed) == replayed | {"machines": ["A"]}
-    assert recorded("B", rerun) == rerun | {"machines": ["A", "B"]}
-    assert recorded("C", replayed) == rerun | {"machines": ["A", "B", "C"]}, "a replay does not undo a re-run"
+    assert recorded("A", replayed) == since | replayed | {"machines": ["A"]}
+    since = {"date": "2026-11-23"}
+    path.write_text(json.dumps(json.loads(path.read_text()) | since))
+    assert recorded("B", rerun) == since | rerun | {"machines": ["A", "B"]}
+    assert recorded("C", replayed) == since | rerun | {"machines": ["A", "B", "C"]}, "a replay does not undo a re-run"
     newer = {"versions": {"sapien": "4"}}
-    assert recorded("D", replayed | newer) == rerun | newer | {"machines": ["D"]}
+    assert recorded("D", replayed | newer) == since | rerun | newer | {"machines": ["D"]}
     other = replayed | {"submission": "1" * 64}
-    assert recorded("E", other) == other | {"machines": ["E"]}
+    assert recorded("E", other) == other | {"date": datetime.now(UTC).date().isoformat(), "machines": ["E"]}
 
 
 def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypatch):

@@ -74,6 +74,11 @@ def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
         piles = {0: [recording(start, perturb=perturb) for start in (7, 8) for perturb in ("", "pose=1")]}
         piles[0][-1].backend = "physx_cuda, gpu rendering"
         made(tmp_path / "made", piles)
+    with pytest.raises(InputError, match="was shown pixels"):
+        piles = {0: [recording(7, obs_type="pixels")]}
+        submit(
+            tmp_path / "made", replace(ABOUT, observes="pixels_agent_pos"), "bins", SETTINGS, piles, {0: "diverged"}
+        )
     with pytest.raises(InputError, match="Nothing was recorded"):
         made(tmp_path / "made", {}, {0: "diverged"})
     with pytest.raises(MissingError, match="seed_0"):

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from lerobot_constructskill.board.protocol import (
     CONTROL,
@@ -11,6 +12,7 @@ from lerobot_constructskill.board.protocol import (
     LEVEL,
     LEVELS,
     PERTURBED_TASK,
+    RANKED_FROM,
     RERUN_ALPHA,
     SUITES,
     TRAINING_SEEDS,
@@ -50,11 +52,18 @@ def test_the_pages_table_is_the_protocol():
 
 def test_the_page_names_the_other_numbers():
     assert f"Training seeds** are 0 to {TRAINING_SEEDS[-1]}." in PAGE
+    assert f"fewer than {RANKED_FROM} training" in PAGE
     assert f"each alone at level {LEVEL}, draw 0" in PAGE and f"`{PERTURBED_TASK}` as it is" in PAGE
     assert f"({', '.join(STAGES)})" in PAGE
     assert all(f"| {level} |" in PAGE for level in LEVELS)
     assert all(f"`{name}`" in PAGE for name in (*About.__dataclass_fields__, *OBSERVES))
     assert f"{DEMO_SEED_START:,}" in PAGE and f"p below {RERUN_ALPHA:g} in a permutation test" in PAGE
+
+
+def test_the_pages_files_are_what_submit_reads():
+    about, settings = re.search("```yaml\n# about.yaml\n(.*?)# settings.yaml\n(.*?)```", PAGE, re.DOTALL).groups()
+    assert About(**yaml.safe_load(about)).observes in OBSERVES
+    assert [Setting(**one).task for one in yaml.safe_load(settings).values()] == ["brick_to_bin_turned"]
 
 
 def test_a_perturbed_setting_has_its_control():
