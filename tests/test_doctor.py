@@ -45,17 +45,17 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
         (checks.judge_vulkan(RENDERS, simulator=True), Level.OK),
         (checks.judge_vulkan(BROKEN, simulator=True), Level.FAIL),
         (checks.judge_vulkan(BROKEN, simulator=False), Level.WARN),
-        (checks.judge_plugin(Probe(True, "True True", "")), Level.OK),
+        (checks.judge_plugin(Probe(True, "said before\nTrue True", "")), Level.OK),
         (checks.judge_plugin(Probe(True, "True False", "")), Level.FAIL),
         (checks.judge_plugin(BROKEN), Level.FAIL),
         (checks.judge_ffmpeg(RENDERS), Level.OK),
         (checks.judge_ffmpeg(BROKEN), Level.WARN),
-        (checks.judge_encoder(Probe(True, "float32 openvino cpu 14.9", "")), Level.OK),
+        (checks.judge_encoder(Probe(True, "said before\nfloat32 openvino cpu 14.9", "")), Level.OK),
         (checks.judge_encoder(Probe(True, "float32 torch cpu 8.5", "")), Level.WARN),
         (checks.judge_encoder(BROKEN), Level.FAIL),
-        (checks.judge_weights(Probe(True, "a\tHub\nb\tHub cache", "")), Level.OK),
-        (checks.judge_weights(Probe(True, "a\tHub\nb", "")), Level.WARN),
-        (checks.judge_weights(Probe(True, "a\t\nb", "")), Level.FAIL),
+        (checks.judge_weights(Probe(True, "said before\na\tHub\nb\tHub cache", "")), Level.OK),
+        (checks.judge_weights(Probe(True, "a\tHub\nb\t", "")), Level.WARN),
+        (checks.judge_weights(Probe(True, "a\t\nb\t", "")), Level.FAIL),
         (checks.judge_weights(BROKEN), Level.FAIL),
         (checks.judge_fetched("a", Probe(True, "said before\nHub\t" + "0" * 64, "")), Level.OK),
         (checks.judge_fetched("a", BROKEN), Level.WARN),
@@ -76,7 +76,7 @@ def test_complaints_name_their_cause() -> None:
     assert versions == "lerobot is 0.5 (needs <0.7,>=0.6.1); pip install 'lerobot[dataset]<0.7,>=0.6.1'."
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
     assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
-    assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb", "")).message
+    assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb\t", "")).message
 
 
 @pytest.mark.parametrize(("level", "status"), [(Level.OK, 0), (Level.WARN, 0), (Level.FAIL, 1)])

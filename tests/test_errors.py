@@ -104,6 +104,16 @@ def test_what_is_no_fault_of_ours_is_not_called_one(error: str, status: int, sai
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_a_reader_who_has_read_enough_is_no_fault(tmp_path: Path) -> None:
+    done = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {Path(sys.executable).parent}/constructskill-config | head -n 1 >/dev/null"],
+        env={"XDG_STATE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0 and not done.stderr and not list(tmp_path.iterdir())
+
+
 def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "state").touch()  # a file, below which there can be no folder
     done = run("constructskill-report", "KeyError('a')", tmp_path / "state")

@@ -7,6 +7,7 @@ from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_constructskill.artifacts.digests import data_sha256
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dataset.frames import packet_times
 from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, plural
@@ -33,7 +34,7 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
     """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else what the Hub has.
 
     Raises:
-        ValueError: neither a name nor a folder was given.
+        ValueError: neither a name nor a folder was given, or a folder and a revision.
         FileNotFoundError: the folder, or the data set on the Hub, is not there.
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
@@ -41,6 +42,8 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
     if root is not None:
         if not root.is_dir():
             raise MissingError(f"There is no folder {root}.")
+        if revision is not None:
+            raise InputError("--revision is of a data set on the Hub, and --root a folder: give one of them.")
         return root
     if repo_id is None:
         raise InputError("Give a data set's name with --repo_id, or its folder with --root.")
@@ -132,18 +135,23 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int]:
     """
     path = checkpoint / TRAIN_CONFIG
     told = json.loads(path.read_text()).get("dataset", {}) if path.is_file() else {}
-    if dataset.repo_id not in (told.get("repo_id"), *_sources(told.get("root"))):
-        return set()
+    folder = Path(told.get("root") or "")
+    sources = _sources(folder)
+    names = {told.get("repo_id"), *(source["source_repo_id"] for source in sources)}
+    if dataset.repo_id not in names and folder.resolve() != dataset.root.resolve():
+        contents = {source["source_sha256"] for source in sources}  # a copy may have another name
+        if not contents or data_sha256(dataset.root) not in contents:
+            return set()
     given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
     return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
 
 
-def _sources(root: str | None) -> set[str]:
-    """Of which data sets a feature set that lies in a folder holds the features."""
-    path = Path(root or "") / "meta" / "info.json"
+def _sources(root: Path) -> list[dict[str, str]]:
+    """What a feature set that lies in a folder says of the data set whose features it holds."""
+    path = root / "meta" / "info.json"
     features = json.loads(path.read_text())["features"] if path.is_file() else {}
     infos = [feature.get("info") or {} for feature in features.values()]
-    return {info["source_repo_id"] for info in infos if "source_repo_id" in info}
+    return [info for info in infos if "source_repo_id" in info]
 
 
 @contextmanager
@@ -171,7 +179,8 @@ def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> 
     if isinstance(error, errors.RepositoryNotFoundError):
         return f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
     if isinstance(error, errors.LocalEntryNotFoundError):
-        return f"The Hub cannot be reached and revision '{revision}' of '{repo_id}' is not in the cache."
+        of = f"revision '{revision}' of " if revision else ""
+        return f"The Hub cannot be reached and {of}'{repo_id}' is not in the cache."
     if isinstance(error, errors.OfflineModeIsEnabled):
         return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
     if isinstance(error, errors.HfHubHTTPError):
@@ -189,8 +198,34 @@ def _refusal(repo_id: str, status: int | None) -> str:
     if status == 401:
         return f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"
     if status == 403:
-        return f"The token of this machine may not write to '{repo_id}': use a name of your own."
+        return (
+            f"The token of this machine may not write to '{repo_id}', or not read it: ask for access, or name another."
+        )
     return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."
+
+
+def check_private(repo_id: str, repo_type: str = "model") -> None:
+    """Refuse a repository that is there and public: the Hub makes new ones private alone.
+
+    Raises:
+        InputError: it is public.
+    """
+    from huggingface_hub import HfApi
+
+    api, repo = HfApi(), {"repo_id": repo_id, "repo_type": repo_type}
+    if api.repo_exists(**repo) and not api.repo_info(**repo).private:
+        raise InputError(f"'{repo_id}' is on the Hub already and public: make it private there, or name another.")
+
+
+def _is_cut(root: Path, **repo: str) -> bool:
+    """Whether a repository without LeRobot's tag holds no data set but that in `root`, whose push was interrupted."""
+    from huggingface_hub import HfApi
+
+    api, info = HfApi(), "meta/info.json"
+    held = {path for path in api.list_repo_files(**repo) if path.startswith(("data/", "meta/", "videos/"))}
+    if info not in held:
+        return not held
+    return Path(api.hf_hub_download(**repo, filename=info)).read_bytes() == (root / info).read_bytes()
 
 
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
@@ -204,7 +239,8 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         update: replace a data set that is whole, and move its tags.
 
     Raises:
-        FileExistsError: the name holds a whole data set and `update` is not set.
+        FileExistsError: the name holds a data set and `update` is not set.
+        InputError: it is public, and `private` is set.
         OSError: the Hub cannot be reached, or refuses the token or the name.
     """
     from huggingface_hub import HfApi
@@ -213,8 +249,10 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
     with one_sentence(repo_id):
         api.create_repo(**repo, private=private, exist_ok=True)
+        if private:
+            check_private(**repo)
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
-        if CODEBASE_VERSION in tagged and not update:
+        if not update and (CODEBASE_VERSION in tagged or not _is_cut(root, **repo)):
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
         commit = api.upload_folder(**repo, folder_path=root, allow_patterns=PUSHED, delete_patterns=stale)

@@ -67,6 +67,9 @@ def edge() -> Iterator[None]:
     logging.getLogger().addFilter(_is_news)
     try:
         yield
+        sys.stdout.flush()
+    except BrokenPipeError:  # of `| head`, which has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (Exception, KeyboardInterrupt) as error:
         sys.exit(_report(error, command, debug))
 

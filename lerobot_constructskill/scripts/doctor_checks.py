@@ -50,6 +50,11 @@ class Probe:
     out: str
     reason: str
 
+    @property
+    def answer(self) -> str:
+        """Its last line: whatever it imports may print before."""
+        return (self.out.splitlines() or [""])[-1]
+
 
 def judge_python(version: tuple[int, int]) -> Finding:
     text = ".".join(map(str, version))
@@ -155,11 +160,11 @@ def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
             f"SAPIEN finds no device to render with ({probe.reason}); {RENDERER}, or on an NVIDIA machine "
             "install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all).",
         )
-    return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{probe.out}'")
+    return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{probe.answer}'")
 
 
 def judge_plugin(probe: Probe) -> Finding:
-    if probe.ok and probe.out == "True True":
+    if probe.ok and probe.answer == "True True":
         return Finding(Level.OK, "Plugin", "LeRobot finds --policy.type=frozen_vit and --env.type=constructskill")
     reason = probe.reason or "its import does not register them"
     return Finding(
@@ -187,7 +192,7 @@ def judge_weights(probe: Probe) -> Finding:
         return Finding(
             Level.FAIL, "Weights", f"the search for them failed ({probe.reason}); fix what fails above first."
         )
-    sources = dict(line.partition("\t")[::2] for line in probe.out.splitlines())
+    sources = dict(line.partition("\t")[::2] for line in probe.out.splitlines() if "\t" in line)
     found = ", ".join(f"{name} ({source})" for name, source in sources.items() if source)
     missing = ", ".join(name for name, source in sources.items() if not source)
     if not missing:
@@ -203,7 +208,7 @@ def judge_fetched(name: str, probe: Probe) -> Finding:
     if not probe.ok:
         reason = probe.reason.partition(": ")[2] or probe.reason
         return Finding(Level.WARN, name, f"{reason.rstrip('.')}.")
-    source, sha256 = probe.out.splitlines()[-1].split("\t")
+    source, sha256 = probe.answer.split("\t")
     return Finding(Level.OK, name, f"{source}, sha256 {sha256[:12]}")
 
 
@@ -211,7 +216,7 @@ def judge_encoder(probe: Probe) -> Finding:
     """Judge a line of what `auto` means here, what computes it, on what device, and images per second."""
     if not probe.ok:
         return Finding(Level.FAIL, "Encoder", f"does not run ({probe.reason}); fix what fails above first.")
-    precision, runtime, device, speed = probe.out.split()
+    precision, runtime, device, speed = probe.answer.split()
     expected = (
         f"backbone_precision=auto is {precision} here, {float(speed):.0f} images/s of dinov2_vits14 by {runtime} on "
         f"the {device}: about {DEMO_FRAMES / float(speed) / 60:.0f} min for 50 demonstrations"

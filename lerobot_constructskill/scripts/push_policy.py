@@ -32,12 +32,14 @@ def push_policy(config: PushPolicyConfig) -> str:
         FileNotFoundError: there is no checkpoint, or no evaluation.
         OSError: the Hub refused, or the connection broke.
     """
-    from lerobot_constructskill.dataset.hub import one_sentence
+    from lerobot_constructskill.dataset.hub import check_private, one_sentence
     from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 
     train, policy = (_read(config.policy_path / name) for name in (TRAIN_CONFIG, "config.json"))
     section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
     with one_sentence(config.repo_id):
+        if config.private:
+            check_private(config.repo_id)
         _push(config, section, policy["device"])
     return f"Pushed: {config.repo_id}"
 

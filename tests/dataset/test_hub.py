@@ -14,7 +14,7 @@ from hub_server import TOKENS, serve
 from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.dataset.hub import pull, push
 from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.errors import TakenError
+from lerobot_constructskill.errors import InputError, TakenError
 from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
 
@@ -159,6 +159,24 @@ def test_a_whole_data_set_is_replaced_only_where_that_is_asked_for(hub, machine,
     repo = hub.repos["datasets/alice/twice"]
     files = repo.commits[repo.tags["v3.0"]]
     assert repo.tags["v3.0"] != first and "README.md" in files and "meta/modality.json" not in files
+
+
+def test_another_data_set_without_lerobots_tag_is_replaced_only_where_that_is_asked_for(hub, machine, pristine, copy):
+    machine(push, pristine, "alice/old")
+    repo = hub.repos["datasets/alice/old"]
+    repo.tags = {"v2.1": repo.tags["v3.0"]}
+    info = copy / "meta" / "info.json"
+    info.write_text(info.read_text() + " ")
+    assert "--update" in refusal(machine, push, copy, "alice/old")
+    assert repo.tags.keys() == {"v2.1"} and repo.branches["main"] == repo.tags["v2.1"]
+    machine(push, copy, "alice/old", update=True)
+    assert repo.tags.keys() == {"v2.1", "v3.0"}
+
+
+def test_what_is_public_is_not_called_private(hub, machine, pristine):
+    machine(push, pristine, "alice/public")
+    with pytest.raises(InputError, match="'alice/public' is on the Hub already and public"):
+        machine(push, pristine, "alice/public", private=True, update=True)
 
 
 def test_a_card_that_somebody_changed_is_pushed_as_it_is(hub, machine, copy):

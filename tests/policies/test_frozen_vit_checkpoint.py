@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lerobot.configs import PreTrainedConfig
 from lerobot.policies import factory
 from safetensors.torch import load_file, load_model, save_file
 
@@ -135,6 +136,23 @@ def test_a_damaged_checkpoint_gets_one_sentence_that_names_the_file(damage, erro
         FrozenViTChunkPolicy.from_pretrained(tmp_path)
     assert "model.safetensors" in str(refusal.value) and "\n" not in str(refusal.value)
     assert refusal.value.__cause__ is None
+
+
+def test_a_random_backbone_that_is_drawn_otherwise_is_refused(make_policy, tmp_path):
+    make_policy(save_backbone=False, backbone_pretrained=False, backbone_path=None).save_pretrained(tmp_path)
+    FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    edit_config(tmp_path, backbone_sha256="0" * 64)
+    with pytest.raises(ValueError, match="asked for have sha256 000000000000"):
+        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize(("name", "value"), [("readout", "mean"), ("crop", (0.1, 0.1, 0.9, 0.9)), ("blind", True)])
+def test_heads_are_not_shown_what_they_were_not_trained_on(name, value, make_policy, tmp_path):
+    make_policy().save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    setattr(config, name, value)
+    with pytest.raises(ValueError, match=f"trained with {name}="):
+        FrozenViTChunkPolicy.from_pretrained(tmp_path, config=config)
 
 
 def test_lerobot_finds_policy_and_processors_by_their_names(make_policy, tmp_path):

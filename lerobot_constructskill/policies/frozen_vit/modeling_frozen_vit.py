@@ -1,5 +1,6 @@
 """The reference policy of the paper: a frozen encoder, two linear heads, overlapping chunks."""
 
+import json
 import logging
 from collections import deque
 from collections.abc import Mapping
@@ -184,6 +185,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 f"The checkpoint '{model_file}' does not fit its configuration ({reason[:300]}): use the "
                 "config.json it was saved with, or train again."
             ) from None
+        model._check_inputs(Path(model_file).with_name("config.json"))
         if holds_backbone:
             model._check_backbone(model_file)
         model._check_statistics(model_file)
@@ -243,6 +245,17 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             )
         self.feature_mean.copy_(torch.as_tensor(stats["mean"]))
         self.feature_std.copy_(torch.as_tensor(stats["std"]).clamp(min=1e-6))
+
+    def _check_inputs(self, path: Path) -> None:
+        """Refuse what would show the heads other numbers of the same shape than they were trained on."""
+        saved = json.loads(path.read_text()) if path.is_file() else {}
+        for name in ("readout", "crop", "blind"):
+            asked = getattr(self.config, name)
+            asked = list(asked) if isinstance(asked, tuple) else asked
+            if asked != (trained := saved.get(name, asked)):
+                raise InputError(
+                    f"The checkpoint was trained with {name}={trained}, so it cannot have {name}={asked}."
+                )
 
     def _check_backbone(self, model_file: str) -> None:
         found, recorded = state_sha256(self.backbone.model.state_dict()), self.config.backbone_sha256

@@ -61,8 +61,8 @@ def check_native(precision: str, device: torch.device | str) -> None:
     if not is_native(precision, device):
         raise NotNativeError(
             f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
-            "backbone_precision=auto, which is float32 here, or float32; a feature set or checkpoint that was made in "
-            f"{precision} runs with --policy.backbone_precision=float32, which logs how far the features drift."
+            f"--policy.backbone_precision=float32, with which what was made in {precision} runs as well and logs "
+            "how far its features drift."
         )
 
 

@@ -46,7 +46,7 @@ def load_weights(
             place looked at, unless it does not exist and `sha256` says what to take from elsewhere.
         sha256: the hash the weights must have; sources with other weights are passed over. Without it, whatever the
             first source holds is taken.
-        pretrained: False draws them at random, the same ones always, and looks nowhere.
+        pretrained: False draws them at random, the same ones always with the same packages, and looks nowhere.
 
     Raises:
         FileNotFoundError: no source has the weights; the message lists the three ways to supply them.
@@ -54,7 +54,13 @@ def load_weights(
         ValueError: a file is damaged or of another architecture.
     """
     if not pretrained:
-        return _random_state(backbone), "random, seed 0"
+        state = _random_state(backbone)
+        if sha256 not in (None, drawn := state_sha256(state)):
+            raise OtherWeightsError(
+                f"The random {backbone.name} weights asked for have sha256 {sha256[:12]}, but {drawn[:12]} are drawn "
+                "here: use the versions of torch and timm that they were first drawn with."
+            )
+        return state, "random, seed 0"
     others = []
     for state, source in _sources(backbone, path, sha256):
         found = state_sha256(state)

@@ -6,6 +6,7 @@ then recorded pins its weights from there on, and a commit also what it is and w
 """
 
 import os.path
+import re
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -81,9 +82,11 @@ def _from_transformers(name: str, repo_id: str, revision: str, path: str | None)
     from transformers import AutoConfig
     from transformers.image_processing_base import ImageProcessingMixin
 
-    folders = {_folder_with(file, repo_id, revision, path) for file in DESCRIPTIONS}
+    folder = _folder_with(DESCRIPTIONS[0], repo_id, revision, path)
+    # The same commit's, where a snapshot is called by it: the branch may have moved since the first was cached.
+    at = folder.name if re.fullmatch("[0-9a-f]{40}", folder.name) else revision
+    _folder_with(DESCRIPTIONS[1], repo_id, at, path)
     try:
-        (folder,) = folders
         config = AutoConfig.from_pretrained(folder)
         pixels, _ = ImageProcessingMixin.get_image_processor_dict(folder)
     except (OSError, ValueError, KeyError) as error:
