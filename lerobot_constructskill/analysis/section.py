@@ -1,6 +1,7 @@
 """How a study is to be read: the `analysis` section of its file, which decides nothing that is run."""
 
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Annotated
@@ -40,6 +41,8 @@ class Analysis:
         for pair in self.comparisons or []:
             if len(pair) != 2 or pair[0] == pair[1]:
                 raise InputError(f"A comparison must be a pair of variants, not {pair}.")
+        if len({frozenset(pair) for pair in self.comparisons or []}) < len(self.comparisons or []):
+            raise InputError("Each comparison is declared once: twice it would count twice in Holm's correction.")
         for name, settings in self.sweeps.items():
             if len(settings) < 2 or len(set(settings)) < len(settings):
                 raise InputError(f"A sweep must be two settings or more, each once; '{name}' is {settings}.")
@@ -60,6 +63,22 @@ class Analysis:
                 raise InputError(f"The sweep '{name}' needs a name that nothing else in the study has.")
             if swept[0] in varied:
                 raise InputError(f"'{swept[0]}' begins the sweep '{name}' and must not be varied in another.")
+
+    def check_settings(self, variants_in: Mapping[str, Collection[str]]) -> None:
+        """Refuse what could be told nowhere, or not apart.
+
+        Args:
+            variants_in: name of a setting to the variants that run in it.
+
+        Raises:
+            InputError: the variants of a comparison never meet, or two of a setting have one label.
+        """
+        for pair in self.comparisons or []:
+            if not any({*pair} <= {*variants} for variants in variants_in.values()):
+                raise InputError(f"{pair[0]} and {pair[1]} cannot be compared: they run in no setting together.")
+        for setting, variants in variants_in.items():
+            if twice := [label for label, n in Counter(map(self.label, variants)).items() if n > 1]:
+                raise InputError(f"Two variants in the setting '{setting}' have the label '{twice[0]}'.")
 
     def label(self, name: str) -> str:
         return self.labels.get(name, name)

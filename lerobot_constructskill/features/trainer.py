@@ -13,7 +13,7 @@ from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.store import Artifact, Store
-from lerobot_constructskill.errors import MissingWeightsError
+from lerobot_constructskill.errors import InputError, MissingWeightsError
 from lerobot_constructskill.features.encode import PARTS, join_feature_sets, load_encoder, write_feature_set
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -36,7 +36,13 @@ class FeatureTrainer:
         return not READOUTS[config.readout].learns
 
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
-        """Write out what `auto` means here, and which weights there are; None where there are none."""
+        """Write out what `auto` means here, and which weights there are; None where there are none.
+
+        Raises:
+            InputError: its heads are to begin as those of a checkpoint.
+        """
+        if config.pretrained_path:
+            raise InputError("A study trains frozen_vit's heads from the start; lerobot-train takes pretrained_path.")
         precision = resolve_precision(config.backbone_precision, config.device)
         spec = get_backbone(config.backbone, config.backbone_path)
         sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)

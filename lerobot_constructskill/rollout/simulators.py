@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -109,9 +110,7 @@ def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> No
             verb, arguments = connection.recv()
         except (EOFError, KeyboardInterrupt):
             break
-        for number in arguments.keys() - envs.keys():
-            envs[number] = ConstructSkillEnv(**env_kwargs[number])
-        connection.send({number: _attempt(verb, envs[number], argument) for number, argument in arguments.items()})
+        connection.send({number: _attempt(verb, number, env_kwargs, envs, arg) for number, arg in arguments.items()})
     for env in envs.values():
         env.close()
 
@@ -137,9 +136,19 @@ def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
 _VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}
 
 
-def _attempt(verb: str, env: ConstructSkillEnv, argument: Any) -> Any:
+def _attempt(
+    verb: str, number: int, env_kwargs: Sequence[Mapping[str, Any]], envs: dict[int, ConstructSkillEnv], argument: Any
+) -> Any:
+    """What an environment, which is opened if need be, answers; or what it raised, in a form that can be sent."""
     try:
-        return _VERBS[verb](env, argument)
+        if number not in envs:
+            envs[number] = ConstructSkillEnv(**env_kwargs[number])
+        return _VERBS[verb](envs[number], argument)
     except Exception as error:
-        error.add_note(full_traceback(error))  # an exception leaves its traceback behind when it leaves the process
+        told = full_traceback(error)  # an exception leaves it behind when it leaves the process
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # whatever a package's own exception may do
+            error = RuntimeError(f"{type(error).__name__}: {error}")
+        error.add_note(told)
         return error

@@ -34,6 +34,7 @@ class StudyConfig(Options, Study):
         super().__post_init__()
         Study.__post_init__(self)
         self.analysis.check(self.variants, self.settings, self.references)
+        self.analysis.check_settings({name: self.variants_in(name) for name in self.settings})
 
     @property
     def study(self) -> Study:

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
+import httpx
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
@@ -32,13 +33,13 @@ from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import NO_MEMORY, trainer_of
+from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
 FILMED_SEED = 0
 
-OF_THE_MACHINE = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
+ERRNOS = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
 """What an `OSError` says of the machine, its disks and its network."""
 
 
@@ -106,9 +107,11 @@ def _let_through(error: Exception) -> None:
     if isinstance(error, TakenError | MachineError | MemoryError):
         raise error
     causes = [error, *_causes(error)]
-    if any(isinstance(one, OSError) and one.errno in OF_THE_MACHINE for one in causes):
+    if any(isinstance(one, ConnectionError | TimeoutError | httpx.HTTPError) for one in causes):
         raise error
-    if any(isinstance(one, RuntimeError) and any(words in str(one) for words in NO_MEMORY) for one in causes):
+    if any(isinstance(one, OSError) and one.errno in ERRNOS for one in causes):
+        raise error
+    if any(isinstance(one, RuntimeError) and any(words in str(one) for words in OF_THE_MACHINE) for one in causes):
         raise error
 
 

@@ -1,9 +1,10 @@
 """Runs a study: what is missing is made, what is there is kept, and its table is always whole."""
 
 import json
+import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from itertools import batched, groupby
 from pathlib import Path
@@ -24,6 +25,8 @@ from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import seconds_by_stage
 from lerobot_constructskill.study.validate import validate
 from lerobot_constructskill.training.trainers import flush_denormals
+
+logger = logging.getLogger(__name__)
 
 
 def run_study(study: Study, text: str, root: Path, store: Store, options: Options) -> Table:
@@ -71,18 +74,22 @@ def _check_nothing_is_lost(table: Table) -> None:
     if lost := table.lost():
         raise InputError(
             f"{table.root} has rows of {plural(len(lost), 'run')}, such as {lost[0]}, that are not of this study as "
-            f"it is, or of other versions of packages, and {table.store.root} does not keep them: they would be lost. "
-            "Give another --root, or move the folder away."
+            f"it is, or of other versions of packages or weights, and {table.store.root} does not keep them: they "
+            "would be lost. Give another --root, or move the folder away."
         )
 
 
 def choose(runs: Sequence[Run], only: str) -> list[Run]:
     """The runs whose `setting/variant/seed_N` fits a pattern of `only` or lies under it; without patterns, all."""
-    either = [pattern for one in only.split(",") for pattern in (one.strip(), f"{one.strip()}/*")]
-    chosen = [run for run in runs if not only or any(fnmatchcase(run.id, pattern) for pattern in either)]
-    if not chosen:
-        raise InputError(f"--only={only} matches no run; the study's first run is {runs[0].id}.")
-    return chosen
+    found = [(one, [run for run in runs if _fits(run, one.strip())]) for one in only.split(",") if only]
+    if bad := [one for one, fitting in found if not fitting]:
+        raise InputError(f"--only={bad[0]} matches no run; the study's first run is {runs[0].id}.")
+    names = {run.id for _, fitting in found for run in fitting}
+    return [run for run in runs if not only or run.id in names]
+
+
+def _fits(run: Run, pattern: str) -> bool:
+    return fnmatchcase(run.id, pattern) or fnmatchcase(run.id, f"{pattern}/*")
 
 
 def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
@@ -93,15 +100,27 @@ def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) ->
 
 
 def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
+    """Make the runs of all jobs. What the machine does to one leaves the others alone, and is raised at the end."""
+    stopped: list[Exception] = []
     if options.executor == "processes":
         for job in jobs:
-            yield from make_runs(job)
-        return
-    from concurrent.futures import as_completed
+            yield from _unless_stopped(lambda job=job: make_runs(job), stopped)
+    else:
+        from concurrent.futures import as_completed
 
-    with open_pool(options.executor, options.workers) as submit:
-        for future in as_completed([submit(_make_all, job) for job in jobs]):
-            yield from future.result()
+        with open_pool(options.executor, options.workers) as submit:
+            for future in as_completed([submit(_make_all, job) for job in jobs]):
+                yield from _unless_stopped(future.result, stopped)
+    if stopped:
+        raise stopped[0]
+
+
+def _unless_stopped(make: Callable[[], Iterable[Run]], stopped: list[Exception]) -> Iterator[Run]:
+    try:
+        yield from make()
+    except (OSError, MemoryError, RuntimeError) as error:
+        logger.warning("The other runs go on; these wait for the same command: %s", " ".join(str(error).split()))
+        stopped.append(error)
 
 
 def _make_all(job: Job) -> list[Run]:
@@ -116,10 +135,14 @@ def _provenance(root: Path) -> dict[str, Any]:
     """What earlier sessions of the study said, each up to the last run that it finished.
 
     Raises:
-        InputError: it says of seconds what is no number.
+        InputError: it is damaged, or says of seconds what is no number.
     """
     path = root / PROVENANCE
-    facts = json.loads(path.read_text()) if path.exists() else {}
+    try:
+        facts = json.loads(path.read_text()) if path.exists() else {}
+        facts["machine"] = str(facts.get("machine", ""))
+    except (ValueError, TypeError, AttributeError):
+        raise InputError(f"'{path}' is not a study's provenance: put it back as it was, or move it away.") from None
     if bad := [name for name, value in facts.items() if name.endswith(", s") and not isinstance(value, int | float)]:
         raise InputError(f"'{path}': '{bad[0]}' must be a number of seconds, not {facts[bad[0]]!r}.")
     return facts
@@ -135,7 +158,7 @@ def _write_provenance(root: Path, earlier: dict[str, Any], before: dict[str, flo
     this = {"wall time, s": seconds}
     for stage, total in seconds_by_stage(root).items():
         this[f"of which {stage}, s"] = total - before.get(stage, 0)
-    machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
+    machines = [*earlier["machine"].split("; "), f"{os.cpu_count()} cores, {processor()}"]
     facts = earlier | {
         **{name: round(earlier.get(name, 0) + seconds) for name, seconds in this.items()},
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),

@@ -181,7 +181,7 @@ def list_runs(study: Study) -> list[Run]:
         common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
             for seeds, drawn in _draws(study, range(count), sets):
-                arm = _reference_arm(study, reference, drawn[setting.data], common)
+                arm = _reference_arm(study, reference, drawn, common)
                 runs += [Run(arm, seed) for seed in seeds]
         for variant_name, variant in study.variants_in(name).items():
             for seeds, drawn in _draws(study, variant.training_seeds, sets):
@@ -227,26 +227,30 @@ def _dagger_config(variant: Variant) -> DaggerConfig:
         return parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
 
 
-def _reference_arm(study: Study, name: str, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
+def _reference_arm(study: Study, name: str, sets: Mapping[str, Demonstrations], common: Mapping[str, Any]) -> Arm:
     if name not in REFERENCES:
         raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
-    reference = REFERENCES[name]
+    reference, setting = REFERENCES[name], common["setting"]
     arm = Arm(name=name, role=REFERENCE if reference.looks else SIGHTLESS, demonstrations=None, **common)
     if reference.policy:
-        base, variant = _variant_with(study, name, reference)
+        base, variant = _variant_with(study, name, reference, setting)
         with _inside(f"references.{name}"):
             fields = {**variant.policy, **reference.policy}
             policies = [settle_policy(one) for one in (fields, *settled_elsewhere(fields))]
             check_inputs(policies[0], common["env"]["obs_type"])
-        training = _training_of(study, common["setting"], base, variant)
+        training = _training_of(study, setting, base, variant)
+        data = sets[study.data_for(setting, variant)]
         here, *elsewhere = [replace(arm, demonstrations=data, policy=one, training=training) for one in policies]
         return replace(here, elsewhere=tuple(elsewhere))
-    return replace(arm, demonstrations=data if reference.reads_demonstrations else None, validated_on=())
+    data = sets[study.settings[setting].data] if reference.reads_demonstrations else None
+    return replace(arm, demonstrations=data, validated_on=())
 
 
-def _variant_with(study: Study, name: str, reference: Reference) -> tuple[str, Variant]:
-    """The first variant whose policy has the fields that a reference sets otherwise."""
-    for of_variant, variant in study.variants.items():
+def _variant_with(study: Study, name: str, reference: Reference, setting: str) -> tuple[str, Variant]:
+    """The first variant in a setting, none of DAgger's, whose policy has the fields that a reference sets."""
+    for of_variant, variant in study.variants_in(setting).items():
+        if variant.dagger:
+            continue
         with _inside(f"variants.{of_variant}.policy"):
             kind = type(decode_policy(variant.policy))
         if all(hasattr(kind, field) for field in reference.policy):

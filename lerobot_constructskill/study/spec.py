@@ -114,8 +114,16 @@ class Study:
             if unknown:
                 known = ", ".join(self.settings)
                 raise InputError(f"Unknown setting '{unknown[0]}' of variant '{name}'; the settings are: {known}.")
+            if variant.settings == []:
+                raise InputError(f"Variant '{name}' must run in one setting or more; without `settings`, in all.")
             if "type" not in variant.policy:
                 raise InputError(f"Variant '{name}' must name its policy's type, such as 'type: frozen_vit'.")
+            if "holdout" in variant.training:
+                raise InputError(
+                    f"Variant '{name}': all variants of a setting hold out the same; give it to the setting."
+                )
+        if bare := [name for name in self.settings if not self.variants_in(name)]:
+            raise InputError(f"No variant runs in the setting '{bare[0]}', so there would be nothing to report.")
 
         agents = [
             (setting, name) for setting in self.settings for name in (*self.variants_in(setting), *self.references)

@@ -54,13 +54,16 @@ class Table:
         Raises:
             InputError: its folder holds something else.
         """
-        name = run.artifact.digest
+        name, kept = run.artifact.digest, self._kept_rows(run)
+        if kept and kept[0].run != name:  # of another kind of machine: what is published stays as it is
+            return kept
         if name not in self._made and self.store.has(run.artifact):
             file = self.store.folder(run.artifact) / EPISODES
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
-        return self._made.get(name) or self._kept_rows(run)
+        made = self._made.get(name)
+        return kept if kept and (made is None or made[0].error_kind) else made
 
     def _kept_rows(self, run: Run, failed: bool = False) -> list[Row] | None:
         """The rows of a run that the table in the folder had, if it ran to its end, or if it failed."""
@@ -68,15 +71,19 @@ class Table:
         return next((rows for rows in kept if bool(rows[0].error_kind) == failed), None)
 
     def lost(self) -> list[str]:
-        """The runs of the table in the folder, failed ones too, that neither this study nor the store has."""
-        ours = {key for run in self.runs for key in _keys(run)}
+        """The runs of the table in the folder that neither this study nor the store has.
+
+        One that failed is not lost where this study has a run of that name: now its weights may be there.
+        """
+        ours, names = {key for run in self.runs for key in _keys(run)}, {run.id for run in self.runs}
         gone = [
             row
             for key, rows in self._kept.items()
             if key not in ours and not (key[-1] and self.store.keeps("runs", key[-1]))
             for row in rows
+            if not (row.error_kind and _name_of(row) in names)
         ]
-        return list(dict.fromkeys(f"{row.setting}/{row.variant}/seed_{row.training_seed}" for row in gone))
+        return list(dict.fromkeys(map(_name_of, gone)))
 
     def forget_failure(self, run: Run) -> None:
         """Discard a run that failed, so that it is made anew, unless somebody has done so."""
@@ -108,7 +115,7 @@ class Table:
         return Row(run=run.artifact.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))
 
     def _made_rows(self, run: Run) -> Iterator[Row]:
-        if run.artifact.digest not in self._made:
+        if isinstance(self.episodes(run)[0], Row):  # of the table in the folder
             yield from (replace(row, **_names(run)) for row in self.episodes(run))
             return
         common = _names(run) | self._heldout_errors(run)
@@ -152,6 +159,11 @@ def _run_so_far(file: Path) -> dict[tuple[str, str, str | None], list[Row]]:
     rows = [row for row in load_rows(file, Row) if row.error_kind != NOT_RUN] if file.exists() else []
     by_run = groupby(rows, key=lambda row: (row.setting, row.variant, row.run))
     return {key: list(episodes) for key, episodes in by_run}
+
+
+def _name_of(row: Row) -> str:
+    """`Run.id` of a row's run."""
+    return f"{row.setting}/{row.variant}/seed_{row.training_seed}"
 
 
 def _keys(run: Run) -> list[tuple[str, str, str]]:

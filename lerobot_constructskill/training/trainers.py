@@ -25,8 +25,14 @@ from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 KILLED = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 """What ends a process from outside: somebody, or the kernel for want of memory. No policy ends itself like this."""
 
-NO_MEMORY = ("can't allocate memory", "out of memory")
-"""What torch says in a `RuntimeError` for want of it, on a CPU and on a GPU."""
+NO_MEMORY = ("can't allocate memory", "out of memory", "OutOfDeviceMemory", "OutOfHostMemory")
+"""What torch, on a CPU and on a GPU, and Vulkan say in a `RuntimeError` for want of it."""
+
+OF_THE_MACHINE = (
+    *(*NO_MEMORY, "No space left on device", "Disk quota exceeded", "CUDA error", "NVIDIA driver"),
+    *("ConnectError", "ConnectionError", "ConnectTimeout", "ReadTimeout", "Connection reset"),
+)
+"""What an error says that is no fault of the policy: disks, network and GPU may do the next time what they did not."""
 
 LOADERS = 4
 """LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
@@ -193,9 +199,14 @@ def _call(command: list[str]) -> str:
         name = signal.Signals(-done.returncode).name
         raise MachineError(f"lerobot-train was killed ({name}), for want of memory perhaps; the same command goes on.")
     if done.returncode and any(words in done.stdout for words in (*NO_MEMORY, "killed by signal")):
-        raise MachineError("lerobot-train, or a process of its own, ran out of memory; the same command goes on.")
+        raise MachineError(
+            "lerobot-train, or a process of its own, ran out of memory: where nothing else takes it, "
+            "training.batch_size is too large for this machine."
+        )
     if done.returncode:
         lines = done.stdout.strip().splitlines() or ["nothing"]
+        if any(words in lines[-1] for words in OF_THE_MACHINE):
+            raise MachineError(f"lerobot-train could not go on: {lines[-1]}")
         error = RuntimeError(f"lerobot-train ended with status {done.returncode} and said last: {lines[-1]}")
         error.add_note(done.stdout)
         raise error

@@ -6,6 +6,7 @@ from dataclasses import replace
 from errno import ENOENT, ENOSPC, ESTALE
 from pathlib import Path
 
+import httpx
 import pandas as pd
 import pytest
 import torch
@@ -13,13 +14,14 @@ import torch
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.errors import InputError, MachineError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study import execute
+from lerobot_constructskill.study import run as run_module
 from lerobot_constructskill.study.execute import EPISODES, Job, _let_through, _together
-from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, read_rows, write_rows
+from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, Row, load_rows, read_rows, write_rows
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
@@ -339,6 +341,7 @@ def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
     row = {"evaluation_seed": 1000, "episode": 0, "error_kind": "weights", "error": "none here"}
     failed = [EpisodeRow(run=run.artifact.digest, training_seed=run.seed, **row) for run in table.runs[:1]]
     write_rows(failed, table.store.folder(table.runs[0].artifact) / EPISODES, EpisodeRow)
+    (tmp_path / "x" / "rows.parquet").unlink()
     Table(tmp_path / "x", table.runs, table.store).write()
     published = read_rows(tmp_path / "x" / "rows.parquet")
     assert set(published["error_kind"].dropna()) == {"weights"}
@@ -416,6 +419,42 @@ def test_no_row_is_lost_that_is_nowhere_else(tmp_path):
     assert set(read_rows(tmp_path / "x" / "rows.parquet")["variant"]) == {"a", "no_op", "replay"}
 
 
+def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_path):
+    table = make_all(study(), tmp_path)
+    published = read_rows(tmp_path / "x" / "rows.parquet")
+    run, mine = table.runs[0], Store(tmp_path / "mine")
+    failed = replace(table.episodes(run)[0], error_kind="fault", error="RuntimeError: ours")
+    with mine.writing(run.artifact) as folder:
+        folder.mkdir()
+        write_rows([failed], folder / EPISODES, EpisodeRow)
+    Table(tmp_path / "x", table.runs, mine).write()
+    pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), published)
+
+
+def test_a_failed_row_is_not_in_the_way_of_whoever_can_make_it(tmp_path):
+    table = make_all(study(), tmp_path)
+    rows = load_rows(tmp_path / "x" / "rows.parquet", Row)
+    other = [
+        replace(row, run="0" * 16, error_kind="weights", error="no weights") for row in rows if row.variant == "b"
+    ]
+    write_rows([row for row in rows if row.variant != "b"] + other, tmp_path / "x" / "rows.parquet")
+    again = Table(tmp_path / "x", table.runs, Store(tmp_path / "elsewhere"))
+    assert not again.lost() and {run.arm.name for run in again.missing()} == {"b"}
+
+
+def test_what_a_machine_lacks_for_one_job_leaves_the_others_alone(tmp_path, monkeypatch):
+    def make(job):
+        if job.runs[0].arm.name == "a":
+            raise MachineError("out of memory")
+        return job.runs
+
+    monkeypatch.setattr(run_module, "make_runs", make)
+    made = []
+    with pytest.raises(MachineError, match="out of memory"):
+        made.extend(run_module._execute(run_module._jobs(list_runs(study()), tmp_path, None, Options()), Options()))
+    assert {run.arm.name for run in made} == {"no_op", "replay", "b"}
+
+
 def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
     table = Table(tmp_path, list_runs(study()), Store(tmp_path / "store"))
     table.write()
@@ -449,6 +488,8 @@ def test_some_runs_are_chosen_by_their_names():
     assert len(choose(list_runs(study(variants={"a": Variant(ACT, 12)})), "fixed/a/seed_1")) == 1
     with pytest.raises(InputError, match="matches no run"):
         choose(runs, "other/*")
+    with pytest.raises(InputError, match="fixd/a matches no run"):
+        choose(runs, "fixed/no_op, fixd/a")
 
 
 def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp_path, tiny_weights):
@@ -463,10 +504,14 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
     assert not untrained.arm.policy.backbone_pretrained and seeing.arm.policy.backbone_pretrained
     with pytest.raises(InputError, match="'blind' needs a variant whose policy has blind"):
         list_runs(study(references={"blind": 1}))
-    unseen = {"fixed": Setting("smoke", ENV), "pixels": Setting("smoke", {"episode_length": 8})}
-    stateful = {"tiny": Variant(tiny | {"use_state": True}, 1, settings=["fixed"])}
-    with pytest.raises(InputError, match="references.blind: .*obs_type"):
-        list_runs(study(settings=unseen, variants=stateful, references={"blind": 1}))
+    two = {"fixed": Setting("smoke", ENV), "pixels": Setting("smoke", {"episode_length": 8})}
+    own = {
+        "stateful": Variant(tiny | {"use_state": True}, 1, settings=["fixed"]),
+        "noisy": Variant(tiny, 1, data="--noise.sigma=0.02", settings=["pixels"]),
+    }
+    stateful, _, noisy, shown = list_runs(study(settings=two, variants=own, references={"blind": 1}))
+    assert stateful.arm.policy.use_state and not noisy.arm.policy.use_state
+    assert noisy.arm.demonstrations == shown.arm.demonstrations, "it differs in its eyes alone"
 
 
 @pytest.mark.parametrize(
@@ -483,6 +528,19 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
             "both 'fixed-a-b' when joined",
         ),
         ({"variants": {"a": Variant({})}}, "must name its policy's type"),
+        ({"variants": {"a": Variant(ACT, settings=[])}}, "in one setting or more"),
+        (
+            {
+                "settings": {"fixed": Setting("smoke", ENV), "bare": Setting("smoke", ENV)},
+                "variants": {"a": Variant(ACT, settings=["fixed"])},
+            },
+            "No variant runs in the setting 'bare'",
+        ),
+        ({"variants": {"a": Variant(ACT, training={"holdout": 4})}}, "hold out the same"),
+        (
+            {"variants": {"a": Variant({"type": "frozen_vit", "pretrained_path": "somewhere"})}},
+            "variants.a.policy: .*heads from the start",
+        ),
         ({"variants": {"a": Variant({"type": "pi9"})}}, "variants.a.policy: .*pi9"),
         ({"variants": {"a": Variant(ACT | {"chunk_sise": 5})}}, "variants.a.policy: .*chunk_sise"),
         (
@@ -565,6 +623,9 @@ def _wrapped(cause: Exception) -> Exception:
             True,
         ),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), True),
+        (RuntimeError("vk::Device::allocateMemory: ErrorOutOfDeviceMemory"), True),
+        (RuntimeError("Found no NVIDIA driver on your system."), True),
+        (_wrapped(httpx.ConnectTimeout("timed out")), True),
         (RuntimeError("shape mismatch"), False),
         (_wrapped(FileNotFoundError(ENOENT, "no weights")), False),
     ],

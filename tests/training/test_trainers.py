@@ -19,6 +19,8 @@ from lerobot_constructskill.training.trainers import _call
 def test_a_training_without_memory_is_the_machines_doing(said):
     with pytest.raises(MachineError, match="ran out of memory"):
         _call([sys.executable, "-c", f"import sys; sys.exit({said!r})"])
+    with pytest.raises(MachineError, match="could not go on: OSError: .* No space left"):
+        _call([sys.executable, "-c", "import sys; sys.exit('OSError: [Errno 28] No space left on device')"])
     with pytest.raises(RuntimeError, match="said last: diverged"):
         _call([sys.executable, "-c", "import sys; sys.exit('diverged')"])
 
