@@ -78,6 +78,7 @@ ARROWS = {
         "envs",
         "features",
         "parsing",
+        "perturbations",
         "plugin",
         "policies",
         "presets",

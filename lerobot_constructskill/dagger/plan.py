@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
@@ -28,8 +29,8 @@ class Plan:
     """What a configuration asks for. Policy 0 learns from the demonstrations, policy k from those of k rounds too.
 
     Raises:
-        InputError: the base cannot be read, its labels are not the expert's, nothing can be a policy, or the policy
-            is to drive and reads what the base does not show.
+        InputError: the base cannot be read, its labels are not the expert's, a start would be used twice, nothing can
+            be a policy, or the policy is to drive and reads what the base does not show.
     """
 
     config: DaggerConfig
@@ -42,6 +43,17 @@ class Plan:
             raise InputError(
                 f"The base '{self.config.base}' has executed actions as labels; DAgger needs the expert's."
             )
+        demonstrations = range(
+            base.seed_start, base.seed_start + base.episodes + int(base.max_failures * base.episodes)
+        )
+        rounds = range(self.config.seed_start, self.config.seed_start + self.config.rounds * self.config.episodes)
+        ranges = {"demonstrations": demonstrations, "rounds": rounds, "evaluation": self.eval_seeds}
+        for (one, these), (other, those) in combinations(ranges.items(), 2):
+            if max(these.start, those.start) < min(these.stop, those.stop):
+                raise InputError(
+                    f"The {one} may have starts {these.start} to {these.stop - 1} and the {other} {those.start} to "
+                    f"{those.stop - 1}: no start may be in both (--seed_start, --eval_seed)."
+                )
         return base
 
     @cached_property

@@ -35,6 +35,12 @@ MEANINGS = {
     "next.done": "whether the episode ends with the action",
 }
 
+ADVISED = {
+    "dart.noise": "executed translation minus the expert's clean one, in DAgger's rounds minus the advised one, m",
+    "phase": "the expert's phase, in a demonstration that of what it did itself and not of the advice",
+}
+"""What they are where `action` is the expert's advice."""
+
 TURNS = "; turns in rad about the same axes, right-handed"
 """What an action also is in a task that turns."""
 
@@ -46,6 +52,7 @@ class Provenance:
     discarded_seeds: list[Seed]
     versions: dict[Word, Version]
     noise_covariance: list[list[float]]
+    sha256: dict[str, str]
 
 
 def card_facts(data: DataSet) -> dict[str, Any]:
@@ -102,7 +109,9 @@ def render(facts: dict[str, Any]) -> str:
         seed_start=DEMO_SEED_START,
         cameras=cameras,
         features={name: feature for name, feature in features.items() if name in MEANINGS},
-        meanings=MEANINGS | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*task.action_names} else {}),
+        meanings=MEANINGS
+        | (ADVISED if "dagger" in facts or facts["generator"]["labels"] == "advice" else {})
+        | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*task.action_names} else {}),
         sigma_mm=[round(float(value), 2) for value in sigma],
         rename_map=_rename_map([camera.key for camera in cameras]),
     )

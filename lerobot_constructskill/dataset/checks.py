@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from lerobot_constructskill.bounds import check_values as check_fields
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     DEMO_SEED_START,
@@ -18,16 +19,18 @@ from lerobot_constructskill.contract import (
     SIM_STATE,
     get_task,
 )
+from lerobot_constructskill.dataset.card import Provenance
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
 from lerobot_constructskill.dataset.rounds import check_rounds
+from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.modality import MODALITY
 from lerobot_constructskill.demos.noise import execute
 from lerobot_constructskill.demos.settings import FRAME_PACKAGES
-from lerobot_constructskill.errors import UserError, plural
+from lerobot_constructskill.errors import InputError, UserError, plural
 
 type Check = Callable[[DataSet], Iterator[str]]
 
@@ -53,6 +56,10 @@ def check_files(data: DataSet) -> Iterator[str]:
 
 
 def check_schema(data: DataSet) -> Iterator[str]:
+    try:
+        check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+    except InputError as error:
+        yield str(error)
     task, features, wanted = get_task(data.config.task), data.info["features"], data.columns
     for name in sorted(wanted.keys() - features.keys()):
         yield f"info.json has no feature {name}."
@@ -222,10 +229,10 @@ def check_hold_out(data: DataSet) -> Iterator[str]:
 def check_statistics(data: DataSet) -> Iterator[str]:
     for name, wanted in frame_statistics(data.root).items():
         for statistic, value in wanted.items():
-            found = data.stats.get(name, {}).get(statistic)
+            found = of_name.get(statistic) if isinstance(of_name := data.stats.get(name), dict) else None
             if found is None:
                 yield f"stats.json has no {statistic} of {name}."
-            elif not np.allclose(found, value, rtol=1e-4, atol=1e-6):
+            elif not _is_close(found, value):
                 yield f"stats.json has {statistic} {found} of {name}; of the frames it is {value.tolist()}."
     for camera in data.cameras:
         if not {"mean", "std", "q01", "q99"} <= data.stats.get(camera, {}).keys():
@@ -254,6 +261,14 @@ def check_provenance(data: DataSet) -> Iterator[str]:
         yield "Whether the light robot was drawn is not recorded."
     if not (data.root / MODALITY).is_file():
         yield f"{MODALITY} is missing."
+
+
+def _is_close(found, value: np.ndarray) -> bool:
+    try:
+        numbers = np.asarray(found, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return numbers.shape == value.shape and np.allclose(numbers, value, rtol=1e-4, atol=1e-6)
 
 
 def _plain(value):

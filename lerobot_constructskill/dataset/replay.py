@@ -22,15 +22,11 @@ class ReplayResult:
 
 
 def replay(data: DataSet, episode: int) -> ReplayResult:
-    """Start from the episode's seed and execute what was executed.
-
-    Raises:
-        OSError: this machine cannot render.
-    """
+    """Start from the episode's seed and execute what was executed."""
     span, config = data.spans()[episode], data.config
     column = {name: data.column(name)[span] for name in ("dart.executed_action", "observation.state", "sim.seed")}
     outcomes = np.stack([data.column("next.reward")[span], data.column("next.success")[span]], axis=1)
-    env = ConstructSkillEnv(config.task, config.obs_type, len(outcomes) + 1, config.light_robot)
+    env = ConstructSkillEnv(config.task, config.obs_type, len(outcomes) + 1, config.light_robot, render_backend="none")
     try:
         env.reset(seed=int(column["sim.seed"][0]))
         states, reached = [], []

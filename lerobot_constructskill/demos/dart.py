@@ -4,47 +4,9 @@ One iteration: train on the demonstrations, fit here, generate with the covarian
 under that noise are then those that the policy's own errors lead to.
 """
 
-from collections.abc import Callable
-
 import numpy as np
-import torch
-from lerobot.datasets import LeRobotDataset
-from lerobot.policies import PreTrainedPolicy
 
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.progress import Progress
-
-
-def policy_errors(
-    policy: PreTrainedPolicy,
-    preprocess: Callable,
-    postprocess: Callable,
-    dataset: LeRobotDataset,
-    episode: int,
-    phases: list[str],
-) -> np.ndarray:
-    """The policy's translation minus the expert's, on the expert's own states, while the phase is one of `phases`.
-
-    Returns:
-        (n, 3) in metres
-    """
-    policy.reset()
-    row = dataset.meta.episodes[episode]
-    errors = []
-    for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
-        frame = dataset[index]
-        batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
-        with torch.inference_mode():
-            action = postprocess(policy.select_action(preprocess(batch | {"task": [frame["task"]]})))
-        if frame["phase"] in phases:
-            errors.append((action[0].float().cpu() - _clean_action(frame))[:3].numpy())
-    return np.array(errors, dtype=np.float64).reshape(-1, 3)
-
-
-def _clean_action(frame: dict) -> torch.Tensor:
-    clean = frame["dart.executed_action"].clone()
-    clean[:3] -= frame["dart.noise"]
-    return clean
 
 
 def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.ndarray:

@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, Subset
 from lerobot_constructskill.contract import GRIPPER, TRANSLATION
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.rollout.agents import PolicyAgent
 
 
 @dataclass(frozen=True)
@@ -211,3 +212,30 @@ def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDatase
     if not times:
         return dataset
     return LeRobotDataset(dataset.repo_id, root=dataset.root, revision=dataset.revision, delta_timestamps=times)
+
+
+def policy_errors(agent: PolicyAgent, dataset: LeRobotDataset, episode: int, phases: list[str]) -> np.ndarray:
+    """The policy's translation minus the expert's, on the expert's own states, while the phase is one of `phases`.
+
+    A policy that samples its actions draws them from the episode's number and the step.
+
+    Returns:
+        (n, 3) in metres
+    """
+    agent.reset(episode)
+    row = dataset.meta.episodes[episode]
+    errors = []
+    for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
+        frame = dataset[index]
+        batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
+        with torch.inference_mode():
+            action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
+        if frame["phase"] in phases:
+            errors.append((action - _clean_action(frame).numpy())[:3])
+    return np.array(errors, dtype=np.float64).reshape(-1, 3)
+
+
+def _clean_action(frame: dict) -> torch.Tensor:
+    clean = frame["dart.executed_action"].clone()
+    clean[:3] -= frame["dart.noise"]
+    return clean

@@ -7,6 +7,7 @@ from typing import Annotated
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.scripts.no_noise import NoNoise
 
@@ -23,10 +24,11 @@ class FilmConfig:
     seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
     noise: NoNoise = field(default_factory=NoNoise)
     perturb: str = ""  # axis=level, separated by commas, as in the environment
+    perturb_seed: Seed = 0  # of what a perturbation draws once
 
     def __post_init__(self):
         check(self)
-        get_task(self.task)
+        Perturbation(self.perturb, self.perturb_seed).check(get_task(self.task))
         if self.out is not None and self.out.suffix != ".mp4":
             raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
@@ -47,7 +49,7 @@ def film(config: FilmConfig) -> str:
 
     out = config.out or Path("outputs") / f"{config.task}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())
-    env = ConstructSkillEnv(config.task, perturb=config.perturb)
+    env = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed)
     frames = []
 
     def watch(phase, obs):

@@ -43,12 +43,12 @@ def fit_noise(config: FitNoiseConfig) -> str:
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.dataset.dataset import read_provenance
     from lerobot_constructskill.dataset.hub import choose_held_out, one_sentence, open_lerobot
-    from lerobot_constructskill.demos.dart import fit_covariance, policy_errors
+    from lerobot_constructskill.demos.dart import fit_covariance
     from lerobot_constructskill.demos.settings import GenerateConfig, generator_facts
     from lerobot_constructskill.parsing import decode
     from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.rollout.agents import PolicyAgent
-    from lerobot_constructskill.rollout.offline import check_actions, shown
+    from lerobot_constructskill.rollout.offline import check_actions, policy_errors, shown
 
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
@@ -57,10 +57,9 @@ def fit_noise(config: FitNoiseConfig) -> str:
         device = config.device or str(auto_select_torch_device())
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
-    pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
     bar = Progress(episodes, "demonstrations", unit="demo")
     with shown(dataset):
-        errors = [policy_errors(*pipeline, dataset, episode, generator["noise"]["phases"]) for episode in bar]
+        errors = [policy_errors(agent, dataset, episode, generator["noise"]["phases"]) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,

@@ -104,6 +104,19 @@ def test_every_shipped_configuration_makes_a_plan(name):
     assert plan.checkpoint(plan.config.rounds).digest != plan.checkpoint(0).digest
 
 
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"seed_start": 1_000_000},
+        {"eval_seed": 2_000_000, "eval_episodes": 1},
+        {"eval_seed": 999_999, "eval_episodes": 2},
+    ],
+)
+def test_no_start_is_in_two_of_demonstrations_rounds_and_evaluation(fields):
+    with pytest.raises(InputError, match="no start may be in both"):
+        _ = Plan(replace(CONFIG, **fields)).base
+
+
 def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives():
     cloned = Variant(FROZEN_VIT, seeds=1, data="--labels=advice")
     variants = {"driven": Variant(FROZEN_VIT, seeds=2, dagger="smoke"), "cloned": cloned}

@@ -12,6 +12,7 @@ import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
 
+from lerobot_constructskill.artifacts.digests import data_sha256
 from lerobot_constructskill.dataset import hub
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
@@ -185,7 +186,9 @@ def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint
 
 def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_path):
     (tmp_path / "features" / "meta").mkdir(parents=True)
-    column = {"info": {"source_repo_id": "alice/set"}}
+    (tmp_path / "copy" / "data").mkdir(parents=True)
+    (tmp_path / "copy" / "data" / "file").write_text("frames")
+    column = {"info": {"source_repo_id": "alice/set", "source_sha256": data_sha256(tmp_path / "copy")}}
     described = {"features": {"observation.features.base": column, "action": {"info": None}, "index": {}}}
     (tmp_path / "features" / "meta" / "info.json").write_text(json.dumps(described))
     told = {
@@ -195,9 +198,16 @@ def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_pa
         "eval_split": 0.3,
     }
     (tmp_path / TRAIN_CONFIG).write_text(json.dumps({"dataset": told}))
-    for repo_id, episodes in (("alice/set", {0, 2}), ("alice/set_encoded", {0, 2}), ("alice/other", set())):
-        assert hub.trained_on(tmp_path, SimpleNamespace(repo_id=repo_id, num_episodes=4)) == episodes
-    assert not hub.trained_on(tmp_path / "nothing", SimpleNamespace(repo_id="alice/set", num_episodes=4))
+    for repo_id, root, episodes in (
+        ("alice/set", "nothing", {0, 2}),
+        ("alice/set_encoded", "nothing", {0, 2}),
+        ("alice/other", "features", {0, 2}),
+        ("alice/other", "copy", {0, 2}),
+        ("alice/other", "nothing", set()),
+    ):
+        asked = SimpleNamespace(repo_id=repo_id, num_episodes=4, root=tmp_path / root)
+        assert hub.trained_on(tmp_path, asked) == episodes
+        assert not hub.trained_on(tmp_path / "nothing", asked)
 
 
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):

@@ -40,7 +40,7 @@ class BrickLadderEnv(PreciseEnv, BrickToBinEnv):
             x, y = (f"{1000 * edge:.1f}" for edge in self.object_size[:2])
             raise InputError(
                 f"This draw of size makes a brick of {x} x {y} mm, which is too large for the bin, "
-                f"{1000 * clearance:g} mm larger than the usual brick: name another --env.perturb_seed."
+                f"{1000 * clearance:g} mm larger than the usual brick: name another perturb_seed."
             )
 
 
