@@ -49,7 +49,7 @@ for seed in $SEEDS; do
         say "Training seed $seed: lerobot-eval, 5 episodes of at most 250 steps"
         with_bar "$OUT/eval_$seed.log" lerobot-eval --policy.path="$train/checkpoints/last/pretrained_model" \
             --env.type=constructskill --env.task=brick_to_bin_shifted --env.obs_type=pixels_agent_pos \
-            --env.episode_length=250 --eval.n_episodes=5 --eval.batch_size=1 --output_dir="$eval"
+            --env.episode_length=250 --seed=2000 --eval.n_episodes=5 --eval.batch_size=1 --output_dir="$eval"
     fi
     say "Outcomes so far"
     python examples/count_outcomes.py "$OUT"

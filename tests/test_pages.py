@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.perturbations import AXES
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -32,6 +33,13 @@ def test_the_readme_is_short_and_leads_to_every_page():
     text = (ROOT / "README.md").read_text()
     assert len(text.splitlines()) <= README_LINES
     assert all(f"(docs/{page.name})" in text for page in PAGES[1:])
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_every_axis_has_its_row_with_its_levels(axis):
+    (row,) = re.findall(rf"^\| `{axis}` \|.*\|$", (ROOT / "docs" / "tasks.md").read_text(), re.MULTILINE)
+    levels = [cell.strip() for cell in row.split("|")[3:-1]]
+    assert [float(level) for level in levels if level] == [*AXES[axis].levels]
 
 
 @pytest.mark.parametrize("task", TASKS)
