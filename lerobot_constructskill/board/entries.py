@@ -87,9 +87,8 @@ class Entry:
         for claim in sorted(self.submission.claims, key=lambda claim: claim.key):
             if claim.setting == setting:
                 claims[claim.training_seed].append(claim)
-        rng = np.random.default_rng(0)  # the same interval whenever the page is made
         placed, lifted = (
-            mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]), rng)
+            mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]))
             for of in ("placed", "lifted")
         )
         return Standing(claims, placed, lifted, sum(one.error is not None for own in claims.values() for one in own))

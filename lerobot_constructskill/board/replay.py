@@ -27,7 +27,6 @@ class Verdict:
     Args:
         replayed: episodes that were executed.
         failed: episodes that have an error in place of actions: there is nothing to execute, and they count as failed.
-        left: episodes that were not looked at.
         steps: that were executed.
         differences: a sentence for every episode that does not end as claimed.
         versions: of the packages that decide what an action does, here.
@@ -35,7 +34,6 @@ class Verdict:
 
     replayed: int
     failed: int
-    left: int
     steps: int
     differences: list[str]
     versions: dict[str, str]
@@ -72,7 +70,6 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
     return Verdict(
         replayed=len(chosen),
         failed=len(submission.claims) - len(acted),
-        left=len(acted) - len(chosen),
         steps=sum(claim.steps for claim in chosen),
         differences=[f"{said}{others}." for said in found],
         versions=versions(*DECIDING),

@@ -91,12 +91,11 @@ def _repeated(runs: pd.DataFrame) -> tuple[int, int]:
 
 def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame) -> SettingFindings:
     """One setting. All but tables is computed in the order of the rows: another order shows the same numbers."""
-    rng = np.random.default_rng(0)
     of_variants = planned["role"] == VARIANT
-    lines = _lines(analysis, planned[of_variants], runs, rng)
-    references = _lines(analysis, planned[~of_variants], runs, rng)
+    lines = _lines(analysis, planned[of_variants], runs)
+    references = _lines(analysis, planned[~of_variants], runs)
     ordered = sorted(lines, key=lambda line: analysis.rank(line.name))
-    tables = _tables(ordered, planned, rng)
+    tables = _tables(ordered, planned)
     made = {line.name: line for line in lines if line.outcomes}
     pairs = _pairs(analysis, lines)
     comparisons = {
@@ -125,14 +124,14 @@ def _pairs(analysis: Analysis, lines: list[Line]) -> Pairs:
     return [(a, b) for a, b in analysis.comparisons if {a, b} <= names]
 
 
-def _lines(analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, rng: np.random.Generator) -> list[Line]:
+def _lines(analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame) -> list[Line]:
     return [
-        _line(analysis.label(name), own, runs[runs["variant"] == name], rng)
+        _line(analysis.label(name), own, runs[runs["variant"] == name])
         for name, own in planned.groupby("variant", sort=False)
     ]
 
 
-def _line(label: str, planned: pd.DataFrame, runs: pd.DataFrame, rng: np.random.Generator) -> Line:
+def _line(label: str, planned: pd.DataFrame, runs: pd.DataFrame) -> Line:
     finished = runs["error_kind"].isna().any()
     by_data = pd.DataFrame([json.loads(errors) for errors in runs["heldout_mse_m2_by_data"].dropna()])
     demonstrations = planned["demonstrations"].dropna()
@@ -143,7 +142,7 @@ def _line(label: str, planned: pd.DataFrame, runs: pd.DataFrame, rng: np.random.
         demonstrations=None if demonstrations.empty else demonstrations.iloc[0],
         training_seeds=tuple(sorted(planned["training_seed"])),
         runs=runs,
-        outcomes={criterion: _outcome(runs, criterion, rng) for criterion in CRITERIA} if finished else {},
+        outcomes={criterion: _outcome(runs, criterion) for criterion in CRITERIA} if finished else {},
         error=_mean_and_range(runs["heldout_mse_m2"]),
         errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
     )
@@ -154,9 +153,9 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
     return Estimate(*map(float, (known.mean(), known.min(), known.max()))) if len(known) else None
 
 
-def _outcome(runs: pd.DataFrame, criterion: str, rng: np.random.Generator) -> Outcome:
+def _outcome(runs: pd.DataFrame, criterion: str) -> Outcome:
     counts, rates = count(runs, criterion), runs[f"{criterion}_rate"].to_numpy()
-    return Outcome(counts, clopper_pearson(counts), mean_rate(rates, rng), float(rates.std()))
+    return Outcome(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
 
 
 def _data_sets(runs: pd.DataFrame) -> list[str]:
@@ -167,20 +166,20 @@ def _data_sets(runs: pd.DataFrame) -> list[str]:
     return sorted(names, key=lambda name: not any(by_data[name] == own for by_data, own in errors if name in by_data))
 
 
-def _tables(lines: list[Line], planned: pd.DataFrame, rng: np.random.Generator) -> list[Table]:
+def _tables(lines: list[Line], planned: pd.DataFrame) -> list[Table]:
     """Variants with equally many seeds stand in one table, as in the paper: I the backbones, II the ablations."""
     ordered = sorted(lines, key=lambda line: -line.seeds)
     tables = [Table(seeds, list(group)) for seeds, group in groupby(ordered, key=lambda line: line.seeds)]
-    return [table._replace(baseline=_baseline(lines[0], planned, table.seeds, rng)) for table in tables]
+    return [table._replace(baseline=_baseline(lines[0], planned, table.seeds)) for table in tables]
 
 
-def _baseline(first: Line, planned: pd.DataFrame, seeds: int, rng: np.random.Generator) -> Line | None:
+def _baseline(first: Line, planned: pd.DataFrame, seeds: int) -> Line | None:
     if first.seeds <= seeds:
         return None
     chosen = first.training_seeds[:seeds]
     own = planned[(planned["variant"] == first.name) & planned["training_seed"].isin(chosen)]
     label = f"{first.label}, first {seeds} seeds" if seeds > 1 else f"{first.label}, first seed"
-    return _line(label, own, first.runs[first.runs["training_seed"].isin(chosen)], rng)
+    return _line(label, own, first.runs[first.runs["training_seed"].isin(chosen)])
 
 
 def _rate_tests(lines: dict[str, Line], pairs: Pairs, criterion: str) -> list[RateTest]:

@@ -8,33 +8,45 @@ nearly always succeeds varies little: spread has to be read beside the mean.
 from collections.abc import Callable
 
 import numpy as np
+from scipy.interpolate import BSpline
+from scipy.optimize import brentq
 from scipy.stats import permutation_test
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 
-DRAWS = 20_000
 PERMUTATIONS = 9999
 """Random ones, where there are more: p is then 0.0001 or more, which Holm multiplies by the number of comparisons."""
 
 
-def mean_rate(rates: np.ndarray, rng: np.random.Generator, level: float = 0.95) -> Estimate:
+def mean_rate(rates: np.ndarray, level: float = 0.95) -> Estimate:
     """Mean over seeds of the share of episodes that succeeded, with an interval over seeds.
 
-    The interval is Gaffke's (2005), for means of numbers between two bounds: quantiles of the mean under weights drawn
-    from a flat Dirichlet distribution over the seeds and one more, which is at 0 for the lower end and at 1 for the
-    upper. Seeds that succeed always or never have Clopper and Pearson's interval, and no distribution is known of
-    which it covers less than `level` (Learned-Miller and Thomas, arXiv:1905.06208, who conjecture that there is none).
-    A bootstrap covers less where seeds nearly always succeed, and of ten equal seeds its interval has no width.
+    The interval is Gaffke's (2005), for means of numbers between two bounds: quantiles of the mean under random
+    weights of the seeds and one more, which is at 0 for the lower end and at 1 for the upper. Seeds that succeed
+    always or never have Clopper and Pearson's interval, and no distribution is known of which it covers less than
+    `level` (Learned-Miller and Thomas, arXiv:1905.06208, who conjecture that there is none). A bootstrap covers less
+    where seeds nearly always succeed, and of ten equal seeds its interval has no width.
 
     Args:
         rates: share in [0, 1] of each seed, (seeds,).
-        rng: source of the weights.
         level: of the interval.
     """
-    weights, tail = rng.dirichlet(np.ones(len(rates) + 1), size=DRAWS), (1 - level) / 2
-    low = np.quantile(weights @ np.array([*rates, 0.0]), tail)
-    high = np.quantile(weights @ np.array([*rates, 1.0]), 1 - tail)
-    return Estimate(float(np.mean(rates)), float(low), min(float(high), 1.0))
+    tail = (1 - level) / 2
+    return Estimate(float(np.mean(rates)), _quantile([*rates, 0.0], tail), _quantile([*rates, 1.0], 1 - tail))
+
+
+def _quantile(points: list[float], share: float) -> float:
+    """Quantile of the mean of points under weights from the flat Dirichlet distribution.
+
+    The density of that mean is the B-spline with the points as knots (Curry and Schoenberg 1966).
+    """
+    knots = np.sort(points)
+    first, last = float(knots[0]), float(knots[-1])
+    if first == last:
+        return first
+    below, whole = BSpline.basis_element(knots).antiderivative(), (last - first) / (len(knots) - 1)
+    # Not to the last point itself, which lies beyond the spline where it is a point several times.
+    return float(brentq(lambda mean: below(mean) / whole - share, first, np.nextafter(last, first), xtol=1e-9))
 
 
 def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
