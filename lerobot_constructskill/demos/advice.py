@@ -13,7 +13,7 @@ from lerobot_constructskill.demos.stance import GROUNDED, Stance
 REVISION = 2
 """Raised with every change of what is advised in any state: frames labelled by other advice are another round's."""
 
-FUNNEL = 0.03
+OVERHEAD = 0.03
 """Horizontal distance to the grasp within which the hand goes down, in metres."""
 
 RISEN = 0.02
@@ -77,7 +77,7 @@ class Memoryless:
         state, grasp = stance.state, self._grasp_point(stance.state)
         above = state.tcp[2] > stance.top + RISEN / 2
         around = abs((grasp - state.tcp) @ state.jaw_axis) < stance.play(stance.skew)
-        is_near = np.linalg.norm((grasp - state.tcp)[:2]) < FUNNEL and self._is_turned(stance)
+        is_near = np.linalg.norm((grasp - state.tcp)[:2]) < OVERHEAD and self._is_turned(stance)
         if is_near and stance.is_open and (above or around):
             at_grasp = self._is_over(state, self._beginning(Phase.DESCEND, state))
             phase = Phase.GRASP if at_grasp else Phase.DESCEND

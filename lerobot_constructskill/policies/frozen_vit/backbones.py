@@ -84,7 +84,7 @@ def _encode_clip(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     return output.pooler_output, model.vision_model.post_layernorm(output.last_hidden_state[:, 1:])
 
 
-def _encode_timm(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
+def _encode_vit(model: nn.Module, pixels: Tensor) -> tuple[Tensor, Tensor]:
     tokens = model.forward_features(pixels)
     return tokens[:, 0], tokens[:, 1:]
 
@@ -166,7 +166,7 @@ BACKBONES = {
             n_patches=196,
             readout="cls_after_norm",  # what the checkpoint's own classifier reads
             build=_build_vit_tiny16,
-            encode=_encode_timm,
+            encode=_encode_vit,
         ),
         Backbone(
             name="vit_tiny16_augreg",
@@ -178,7 +178,7 @@ BACKBONES = {
             n_patches=196,
             readout="cls_after_norm",
             build=_build_vit_tiny16,
-            encode=_encode_timm,
+            encode=_encode_vit,
         ),
         Backbone(
             name="mobilenet_v2",
