@@ -33,7 +33,7 @@ Logit = Annotated[float, Range(-100, 100)]
 Weight = Annotated[float, Range(above=0, most=1e9)]
 Rate = Annotated[float, Range(above=0, most=10)]
 Decay = Annotated[float, Range(0, 10)]
-DeviceName = Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, cuda:0, mps, xpu")]
+DeviceName = Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, mps, xpu")]
 Edge = Annotated[float, Range(0, 1)]
 
 
