@@ -43,7 +43,10 @@ def pages(root: Path) -> dict[str, str]:
 
 def with_links(markdown: str) -> str:
     """The table of tasks, where each name leads to the task's page."""
-    return re.sub(r"^\| `(\w+)` \|", lambda row: f"| [`{row[1]}`](tasks/{row[1]}.md) |", markdown, flags=re.MULTILINE)
+    names = "|".join(TASKS)
+    return re.sub(
+        rf"^\| `({names})` \|", lambda row: f"| [`{row[1]}`](tasks/{row[1]}.md) |", markdown, flags=re.MULTILINE
+    )
 
 
 def known_limits(markdown: str) -> dict[str, str]:
