@@ -145,15 +145,25 @@ def test_the_traceback_tells_what_a_sentence_hides() -> None:
 
 
 def test_a_traceback_comes_home_from_a_simulators_process() -> None:
-    from lerobot_constructskill.rollout.simulators import _attempt
+    from lerobot_constructskill.rollout.simulators import _attempt, _reset
 
     class Broken:
         def reset(self, seed):
             raise KeyError(seed)
 
-    error = pickle.loads(pickle.dumps(_attempt("reset", Broken(), 7)))
+    class OddError(Exception):
+        def __init__(self, one, two):
+            super().__init__(f"{one} and {two}")
+
+    class Odder:
+        def reset(self, seed):
+            raise OddError(seed, 8)
+
+    error = pickle.loads(pickle.dumps(_attempt(_reset, Broken(), 7)))
     assert type(error) is KeyError and error.args == (7,)
     assert "in reset\n    raise KeyError(seed)" in full_traceback(error)
+    error = pickle.loads(pickle.dumps(_attempt(_reset, Odder(), 7)))
+    assert type(error) is RuntimeError and str(error) == "OddError: 7 and 8"
 
 
 def test_a_missing_package_is_named_with_its_extra() -> None:

@@ -3,7 +3,7 @@
 import multiprocessing
 import os
 import pickle
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -105,12 +105,18 @@ def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> No
     die_with_parent()
     _use_one_thread()
     envs: dict[int, ConstructSkillEnv] = {}
+
+    def answer(verb: str, number: int, argument: Any) -> Any:
+        if number not in envs:
+            envs[number] = ConstructSkillEnv(**env_kwargs[number])
+        return _VERBS[verb](envs[number], argument)
+
     while True:
         try:
             verb, arguments = connection.recv()
         except (EOFError, KeyboardInterrupt):
             break
-        connection.send({number: _attempt(verb, number, env_kwargs, envs, arg) for number, arg in arguments.items()})
+        connection.send({number: _attempt(answer, verb, number, one) for number, one in arguments.items()})
     for env in envs.values():
         env.close()
 
@@ -136,14 +142,10 @@ def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
 _VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}
 
 
-def _attempt(
-    verb: str, number: int, env_kwargs: Sequence[Mapping[str, Any]], envs: dict[int, ConstructSkillEnv], argument: Any
-) -> Any:
-    """What an environment, which is opened if need be, answers; or what it raised, in a form that can be sent."""
+def _attempt(call: Callable[..., Any], *arguments: Any) -> Any:
+    """What a call returns, or what it raises, in a form that can be sent."""
     try:
-        if number not in envs:
-            envs[number] = ConstructSkillEnv(**env_kwargs[number])
-        return _VERBS[verb](envs[number], argument)
+        return call(*arguments)
     except Exception as error:
         told = full_traceback(error)  # an exception leaves it behind when it leaves the process
         try:
