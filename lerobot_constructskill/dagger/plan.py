@@ -43,18 +43,23 @@ class Plan:
             raise InputError(
                 f"The base '{self.config.base}' has executed actions as labels; DAgger needs the expert's."
             )
-        demonstrations = range(
-            base.seed_start, base.seed_start + base.episodes + int(base.max_failures * base.episodes)
-        )
-        rounds = range(self.config.seed_start, self.config.seed_start + self.config.rounds * self.config.episodes)
-        ranges = {"demonstrations": demonstrations, "rounds": rounds, "evaluation": self.eval_seeds}
-        for (one, these), (other, those) in combinations(ranges.items(), 2):
+        self._check_starts(base)
+        return base
+
+    def _check_starts(self, base: GenerateConfig) -> None:
+        """Refuse a start that two of demonstrations, rounds and evaluation would have."""
+        attempts = base.episodes + int(base.max_failures * base.episodes)
+        starts = {
+            "demonstrations": range(base.seed_start, base.seed_start + attempts),
+            "rounds": range(self.seeds(1).start, self.seeds(self.config.rounds).stop),
+            "evaluation": self.eval_seeds,
+        }
+        for (one, these), (other, those) in combinations(starts.items(), 2):
             if max(these.start, those.start) < min(these.stop, those.stop):
                 raise InputError(
                     f"The {one} may have starts {these.start} to {these.stop - 1} and the {other} {those.start} to "
                     f"{those.stop - 1}: no start may be in both (--seed_start, --eval_seed)."
                 )
-        return base
 
     @cached_property
     def policy(self) -> PreTrainedConfig:

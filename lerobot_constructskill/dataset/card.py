@@ -46,7 +46,7 @@ TURNS = "; turns in rad about the same axes, right-handed"
 
 
 class Provenance:
-    """What a card quotes of `meta/constructskill.json`, beside the configuration."""
+    """What cards and checks read of `meta/constructskill.json`, beside the configuration."""
 
     attempts: Count
     discarded_seeds: list[Seed]

@@ -135,13 +135,16 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int]:
     """
     path = checkpoint / TRAIN_CONFIG
     told = json.loads(path.read_text()).get("dataset", {}) if path.is_file() else {}
-    folder = Path(told.get("root") or "")
-    sources = _sources(folder)
-    names = {told.get("repo_id"), *(source["source_repo_id"] for source in sources)}
-    if dataset.repo_id not in names and folder.resolve() != dataset.root.resolve():
-        contents = {source["source_sha256"] for source in sources}  # a copy may have another name
-        if not contents or data_sha256(dataset.root) not in contents:
-            return set()
+    folder = Path(told["root"]) if told.get("root") else None
+    sources = _sources(folder) if folder else []
+    is_it = (
+        dataset.repo_id in (told.get("repo_id"), *(source["source_repo_id"] for source in sources))
+        or (folder is not None and folder.resolve() == dataset.root.resolve())
+        # Last, for it reads every file: a copy may have another name.
+        or any(source["source_sha256"] == data_sha256(dataset.root) for source in sources)
+    )
+    if not is_it:
+        return set()
     given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
     return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
 

@@ -228,8 +228,7 @@ def policy_errors(agent: PolicyAgent, dataset: LeRobotDataset, episode: int, pha
     for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
         frame = dataset[index]
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
-        with torch.inference_mode():
-            action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
+        action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
         if frame["phase"] in phases:
             errors.append((action - _clean_action(frame).numpy())[:3])
     return np.array(errors, dtype=np.float64).reshape(-1, 3)

@@ -105,7 +105,7 @@ def probe(code: str) -> Probe:
     complaint = (done.stderr.strip().splitlines() or [""])[-1]
     if done.returncode < 0:
         complaint = f"the process died of signal {-done.returncode}"
-    return Probe(done.returncode == 0, done.stdout.strip(" \n"), complaint)
+    return Probe(done.returncode == 0, done.stdout.strip(" \n"), complaint)  # a tab at the end says something
 
 
 def installed_versions() -> dict[str, str]:

@@ -4,7 +4,8 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from itertools import batched, groupby
 from pathlib import Path
@@ -81,15 +82,16 @@ def _check_nothing_is_lost(table: Table) -> None:
 
 def choose(runs: Sequence[Run], only: str) -> list[Run]:
     """The runs whose `setting/variant/seed_N` fits a pattern of `only` or lies under it; without patterns, all."""
-    found = [(one, [run for run in runs if _fits(run, one.strip())]) for one in only.split(",") if only]
-    if bad := [one for one, fitting in found if not fitting]:
-        raise InputError(f"--only={bad[0]} matches no run; the study's first run is {runs[0].id}.")
-    names = {run.id for _, fitting in found for run in fitting}
-    return [run for run in runs if not only or run.id in names]
-
-
-def _fits(run: Run, pattern: str) -> bool:
-    return fnmatchcase(run.id, pattern) or fnmatchcase(run.id, f"{pattern}/*")
+    if not only:
+        return list(runs)
+    chosen = set()
+    for one in only.split(","):
+        either = one.strip(), f"{one.strip()}/*"
+        fitting = {run.id for run in runs if any(fnmatchcase(run.id, pattern) for pattern in either)}
+        if not fitting:
+            raise InputError(f"--only={one} matches no run; the study's first run is {runs[0].id}.")
+        chosen |= fitting
+    return [run for run in runs if run.id in chosen]
 
 
 def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
@@ -104,20 +106,24 @@ def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
     stopped: list[Exception] = []
     if options.executor == "processes":
         for job in jobs:
-            yield from _unless_stopped(lambda job=job: make_runs(job), stopped)
+            with _noted(stopped):
+                yield from make_runs(job)
     else:
         from concurrent.futures import as_completed
 
         with open_pool(options.executor, options.workers) as submit:
             for future in as_completed([submit(_make_all, job) for job in jobs]):
-                yield from _unless_stopped(future.result, stopped)
+                with _noted(stopped):
+                    yield from future.result()
     if stopped:
         raise stopped[0]
 
 
-def _unless_stopped(make: Callable[[], Iterable[Run]], stopped: list[Exception]) -> Iterator[Run]:
+@contextmanager
+def _noted(stopped: list[Exception]) -> Iterator[None]:
+    """Put what stops one job where it is found at the end."""
     try:
-        yield from make()
+        yield
     except (OSError, MemoryError, RuntimeError) as error:
         logger.warning("The other runs go on; these wait for the same command: %s", " ".join(str(error).split()))
         stopped.append(error)
