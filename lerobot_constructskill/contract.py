@@ -143,6 +143,9 @@ _PRECISE = "lerobot_constructskill.demos.precise:PreciseExpert"
 _TURNING = "lerobot_constructskill.demos.precise:TurningExpert"
 _SCENES = "lerobot_constructskill.sim.tasks"
 
+BRICK = (0.21, 0.065, 0.10)
+"""Size of the paper's brick as it stands, in metres: Waaldickformat, on its long narrow face."""
+
 LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}
 """The tolerance ladder: task name to the total clearance in x and in y, in metres."""
 

@@ -1,6 +1,7 @@
 """`--env.type=constructskill`."""
 
 import multiprocessing
+import os
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
@@ -13,7 +14,8 @@ from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, frozen_at_end
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
-from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+from lerobot_constructskill.envs.recording import FOLDER, recording_into
+from lerobot_constructskill.envs.vector_env import NativeVectorEnv, check_unperturbed
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.perturbations import Perturbation
 
@@ -69,8 +71,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         check(self)
         if self.max_parallel_tasks != 1:
             raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
-        if self.vectorization == "native" and self.perturb:
-            raise InputError("Each environment draws its own perturbation; use vectorization=process with them.")
+        if self.vectorization == "native":
+            check_unperturbed(self.perturb)
         rows = [row for suite in select_tasks(self.task).values() for row in suite]
         for row in rows:
             self._make_env(row.name)  # refuses what no environment can be made with
@@ -101,6 +103,7 @@ class ConstructSkillEnvConfig(EnvConfig):
             # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.
             multiprocessing.set_forkserver_preload(["lerobot.envs.utils", "lerobot_constructskill.sim.register"])
             probe = self._make_env(task)
+            env_fns = [partial(recording_into, os.environ.get(FOLDER), fn) for fn in env_fns]
             return LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
         return gym.vector.SyncVectorEnv(
             [partial(frozen_at_end, fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP

@@ -12,8 +12,10 @@ from gymnasium import spaces
 
 from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
 from lerobot_constructskill.contract import (
+    BRICK,
     FPS,
     IMAGE_SIZE,
+    LADDER,
     OBS_TYPES,
     STATE_NAMES,
     get_task,
@@ -26,6 +28,8 @@ from lerobot_constructskill.perturbations import Perturbation
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
 RenderBackend = Annotated[str, Among((*SEEING, "none"))]
+
+UNBORN = "Call reset() first: the simulator is born on the first reset."
 
 
 class ConstructSkillEnv(gym.Env):
@@ -52,7 +56,8 @@ class ConstructSkillEnv(gym.Env):
         cameras: those of `obs_type` that are rendered, all by default; one is faster than two, and shows the same.
 
     Raises:
-        ValueError: no such task, obs_type, render_backend, camera, axis or level, or an episode_length below 1.
+        ValueError: no such task, obs_type, render_backend, camera, axis or level, an episode_length below 1, or a
+            brick drawn too large for its bin.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
@@ -74,6 +79,7 @@ class ConstructSkillEnv(gym.Env):
         self._row = get_task(task)
         self._perturbation.check(self._row)
         self.task = task
+        self._check_fits()
         self.task_description = self._row.instruction
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
@@ -90,10 +96,17 @@ class ConstructSkillEnv(gym.Env):
             "perturbation": self._perturbation,
         }
         self._env = None
+        self._has_started = False
         self._steps = 0
         self._recording = None
         self.observation_space = self._make_observation_space()
         self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
+
+    def _check_fits(self) -> None:
+        if self._perturbation.amount("size") and self.task in LADDER:
+            from lerobot_constructskill.sim.perturb import Draws, check_fits
+
+            check_fits(Draws(self._perturbation).brick(BRICK), LADDER[self.task])
 
     def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
@@ -113,6 +126,7 @@ class ConstructSkillEnv(gym.Env):
             seed = int(self.np_random.integers(2**31))
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
         obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
+        self._has_started = True
         self._steps = 0
         self._pixel_rngs = {
             name: np.random.default_rng([seed, self._perturbation.seed, zlib.crc32(f"sensor {name}".encode())])
@@ -128,9 +142,7 @@ class ConstructSkillEnv(gym.Env):
             RuntimeError: before the first `reset`.
             ValueError: an action of another shape, or not finite.
         """
-        if self._env is None:
-            raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
-        obs, reward, terminated, _, info = self._env.step(self.maniskill_action(action))
+        obs, reward, terminated, _, info = self._started().step(self.maniskill_action(action))
         self._steps += 1
         terminated, truncated, info = bool(terminated[0]), self._steps >= self._max_episode_steps, self._info(info)
         if self._recording is not None:
@@ -141,24 +153,25 @@ class ConstructSkillEnv(gym.Env):
         return self._observation(obs), float(reward[0]), terminated, truncated, info
 
     def render(self) -> np.ndarray:
-        """A close-up of the scene, (H, W, 3) uint8."""
-        return self._ensure_env().render()[0].cpu().numpy()
+        """A close-up of the scene, (H, W, 3) uint8. Raises as `step` does."""
+        return self._started().render()[0].cpu().numpy()
 
     def close(self) -> None:
         if self._env is not None:
             self._env.close()
             self._env = None
+            self._has_started = False
 
     # For experts and recorders
 
     def privileged_state(self) -> dict[str, np.ndarray]:
-        """The simulator's state, `contract.SIM_STATE` name to float32 array."""
-        state = self._ensure_env().privileged_state()
+        """The simulator's state, `contract.SIM_STATE` name to float32 array. Raises as `step` does."""
+        state = self._started().privileged_state()
         return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
 
     def agent_state(self) -> np.ndarray:
-        """Proprioception as `contract.STATE_NAMES` names it, (8,) float32."""
-        return self._ensure_env().agent_state()[0].cpu().numpy().astype(np.float32)
+        """Proprioception as `contract.STATE_NAMES` names it, (8,) float32. Raises as `step` does."""
+        return self._started().agent_state()[0].cpu().numpy().astype(np.float32)
 
     @property
     def light_robot(self) -> bool:
@@ -195,6 +208,11 @@ class ConstructSkillEnv(gym.Env):
     def _ensure_env(self) -> gym.Env:
         if self._env is None:
             self._env = self.make_scene()
+        return self._env
+
+    def _started(self) -> gym.Env:
+        if not self._has_started:
+            raise RuntimeError(UNBORN)
         return self._env
 
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ runs it: `lerobot-eval`, an evaluation harness, a loop of one's own. A study kee
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -86,8 +86,8 @@ class Recording(Outcome):
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
-        """Keep an executed action, (A,), and count what came of it."""
-        self.actions.append(np.asarray(action, dtype=np.float32))
+        """Keep a copy of an executed action, (A,), and count what came of it."""
+        self.actions.append(np.array(action, dtype=np.float32))
         self.count(info)
 
     @classmethod
@@ -127,6 +127,17 @@ def compressed(actions: str) -> dict[str, Any]:
 def recorder(**facts: Any) -> Recording | None:
     """A new recording, if this process records; `facts` are fields of `Recording`."""
     return Recording(**facts) if os.environ.get(FOLDER) else None
+
+
+def recording_into(folder: str | None, make: Callable[[], Any]) -> Any:
+    """What `make` makes, in a process that records into `folder`, or not at all.
+
+    A worker has the variables of the server that it is forked from, which are those of an earlier time.
+    """
+    os.environ.pop(FOLDER, None)
+    if folder:
+        os.environ[FOLDER] = folder
+    return make()
 
 
 def keep(recording: Recording | None) -> None:

@@ -13,9 +13,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.gym_env import UNBORN, ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError, MachineError
+
+
+def check_unperturbed(perturb: str) -> None:
+    """Raise InputError where a perturbation is asked of environments that share a simulator."""
+    if perturb:
+        raise InputError("Each environment draws its own perturbation; use vectorization=process with them.")
 
 
 class NativeVectorEnv(gym.vector.VectorEnv):
@@ -30,13 +36,14 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         kwargs: those of `ConstructSkillEnv`.
 
     Raises:
-        InputError: episodes are to be recorded, which it cannot.
+        InputError: episodes are to be recorded or perturbed, which it cannot.
         OSError: there is no GPU for more than one (on the first `reset`).
     """
 
     def __init__(self, n_envs: int, **kwargs: Any):
         if os.environ.get(FOLDER):
             raise InputError(f"${FOLDER} records one environment per simulator only; use vectorization=process.")
+        check_unperturbed(kwargs.get("perturb", ""))
         self._single = ConstructSkillEnv(**kwargs)
         self.num_envs = n_envs
         self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
@@ -53,11 +60,17 @@ class NativeVectorEnv(gym.vector.VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode in every environment; an integer seeds environment i with `seed + i`."""
+        """Start an episode in every environment; an integer seeds environment i with `seed + i`.
+
+        Raises:
+            InputError: there is not one seed for each environment.
+        """
         if isinstance(seed, Integral):
             super().reset(seed=int(seed))
             seed = range(seed, seed + self.num_envs)
         seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
+        if len(seeds) != self.num_envs:
+            raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
         if self._env is None:
             self._env = self._make_scene()
         # As in `ConstructSkillEnv`: PhysX would keep contacts.
@@ -72,8 +85,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        if self._env is None:
-            raise RuntimeError("Call reset() before step(): the simulator is born on the first reset.")
+        self._check_started()
         scaled = np.stack([self._single.maniskill_action(action) for action in actions])
         obs, reward, terminated, _, info = self._env.step(scaled)
         self._steps += 1
@@ -88,7 +100,12 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         return transition
 
     def render(self) -> tuple[np.ndarray, ...]:
-        """A close-up of every environment, each (H, W, 3) uint8."""
+        """A close-up of every environment, each (H, W, 3) uint8.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+        """
+        self._check_started()
         return tuple(self._env.render().cpu().numpy())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -105,6 +122,10 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         if self._env is not None:
             self._env.close()
             self._env = None
+
+    def _check_started(self) -> None:
+        if self._env is None:
+            raise RuntimeError(UNBORN)
 
     def _make_scene(self) -> gym.Env:
         try:

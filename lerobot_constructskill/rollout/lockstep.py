@@ -106,7 +106,7 @@ class _Lanes:
         self.current = self._settle(self.sims.step(actions))
         for i, step in self.current.items():
             self.outcomes[i].episodes[-1].add(step)
-            self.outcomes[i].actions[-1].append(actions[i])
+            self.outcomes[i].actions[-1].append(np.array(actions[i]))  # an agent may use its array again
             if self.on_step:
                 self.on_step(i, len(self.outcomes[i].episodes) - 1, actions[i], step)
         finished = [i for i, step in self.current.items() if step.done]

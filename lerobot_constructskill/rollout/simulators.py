@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import pickle
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -103,6 +104,7 @@ def simulators(env_kwargs: Sequence[Mapping[str, Any]], n_workers: int | None = 
 def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> None:
     """Serve environments until the other side hangs up."""
     die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the other side handles it and hangs up
     _use_one_thread()
     envs: dict[int, ConstructSkillEnv] = {}
 
@@ -114,9 +116,9 @@ def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> No
     while True:
         try:
             verb, arguments = connection.recv()
-        except (EOFError, KeyboardInterrupt):
+            connection.send({number: _attempt(answer, verb, number, one) for number, one in arguments.items()})
+        except (EOFError, ConnectionError):
             break
-        connection.send({number: _attempt(answer, verb, number, one) for number, one in arguments.items()})
     for env in envs.values():
         env.close()
 

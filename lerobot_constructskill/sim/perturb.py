@@ -5,7 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_constructskill.contract import BRICK
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
+
+
+def check_fits(size: tuple[float, ...], clearance: float) -> None:
+    """Raise InputError where a brick of a drawn size, in metres, is too large for a bin of the ladder."""
+    if any(edge > usual + clearance for edge, usual in zip(size[:2], BRICK[:2], strict=True)):
+        x, y = (f"{1000 * edge:.1f}" for edge in size[:2])
+        raise InputError(
+            f"This draw of size makes a brick of {x} x {y} mm, which is too large for the bin, "
+            f"{1000 * clearance:g} mm larger than the usual brick: name another perturb_seed."
+        )
 
 
 @dataclass(frozen=True)

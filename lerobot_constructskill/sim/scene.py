@@ -19,6 +19,7 @@ from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
 from lerobot_constructskill.contract import (
+    BRICK,
     CAMERAS,
     FPS,
     IMAGE_SIZE,
@@ -104,7 +105,7 @@ class PickPlaceEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("sparse", "none")
 
     # The four geometry constants, in metres.
-    object_size = (0.21, 0.065, 0.10)
+    object_size = BRICK
     object_center = (0.0, 0.0)
     bin_center = (0.0, -0.35)
     bin_interior = (0.25, 0.20, 0.15)
@@ -266,6 +267,11 @@ class PickPlaceEnv(BaseEnv):
 
     # Initial state
 
+    def _set_episode_rng(self, seed, env_idx: torch.Tensor) -> None:
+        # ManiSkill leaves the last seed standing where a reset has none, and goes on with the generators.
+        self._has_own_seed = seed is not None
+        super()._set_episode_rng(seed, env_idx)
+
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         with torch.device(self.device):
             self.agent.reset(self._initial_qpos(env_idx))
@@ -287,8 +293,12 @@ class PickPlaceEnv(BaseEnv):
         rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")
         if not amount:
             return rest
-        seeds = [[int(self._episode_seed[i]), self.draws.perturbation.seed] for i in env_idx.cpu()]
-        noise = np.array([np.random.default_rng(seed).standard_normal(len(rest) - 2) for seed in seeds])
+        arms = len(rest) - 2
+        if self._has_own_seed:
+            seeds = [[int(self._episode_seed[i]), self.draws.perturbation.seed] for i in env_idx.cpu()]
+            noise = np.array([np.random.default_rng(seed).standard_normal(arms) for seed in seeds])
+        else:
+            noise = np.reshape(self._batched_episode_rng[env_idx].standard_normal(size=arms), (-1, arms))
         return rest + amount * np.pad(noise, ((0, 0), (0, 2)))
 
     def _spawn_offsets(self, rng: BatchedRNG) -> np.ndarray:

@@ -159,9 +159,32 @@ def test_a_positive_dyaw_turns_the_hand_to_the_left_by_about_a_third_of_what_was
     assert 0.1 < turned < 0.5
 
 
-def test_stepping_before_the_first_reset_is_refused():
+USES = (lambda env: env.step(HOVER), ConstructSkillEnv.privileged_state, ConstructSkillEnv.agent_state)
+
+
+@pytest.mark.parametrize("use", [*USES, ConstructSkillEnv.render])
+def test_nothing_is_had_of_an_episode_before_the_first_reset(use):
     with pytest.raises(RuntimeError, match="reset"):
-        ConstructSkillEnv().step(HOVER)
+        use(ConstructSkillEnv())
+
+
+@pytest.mark.sim
+def test_a_simulator_without_an_episode_and_a_closed_environment_show_nothing():
+    env = ConstructSkillEnv(render_backend="none")
+    assert env.backend.startswith("physx_cpu")
+    for _ in range(2):
+        for use in USES:
+            with pytest.raises(RuntimeError, match="reset"):
+                use(env)
+        env.reset(seed=1)
+        env.close()
+
+
+@pytest.mark.parametrize("build", [ConstructSkillEnv, ConstructSkillEnvConfig])
+def test_a_brick_that_is_drawn_too_large_for_its_bin_is_refused_at_once(build):
+    build(task="brick_to_bin_40mm", perturb="size=2")
+    with pytest.raises(UserError, match="too large for the bin, 3 mm larger"):
+        build(task="brick_to_bin_3mm", perturb="size=2")
 
 
 @pytest.mark.sim

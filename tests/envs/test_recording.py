@@ -9,7 +9,7 @@ import pytest
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import FOLDER, Recording, read_recordings, write_recordings
+from lerobot_constructskill.envs.recording import FOLDER, Recording, read_recordings, recording_into, write_recordings
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError
 
@@ -27,6 +27,14 @@ def test_recordings_are_read_as_they_were_written(tmp_path):
     (tmp_path / "other.parquet").write_bytes(b"no parquet")
     with pytest.raises(InputError, match="cannot be read"):
         read_recordings(tmp_path / "other.parquet")
+
+
+def test_an_array_that_its_caller_uses_again_is_recorded_as_it_was():
+    recording, action = Recording(7), np.zeros(4, np.float32)
+    for number in range(3):
+        action[:] = number
+        recording.add(action, {"is_lifted": False, "is_in_bin": False, "is_success": False})
+    np.testing.assert_array_equal(recording.flat, np.repeat(np.float32([0, 1, 2]), 4))
 
 
 @pytest.mark.sim
@@ -71,6 +79,12 @@ def test_lerobots_vector_environments_record(use_async_envs, tmp_path):
     assert [(one.evaluation_seed, one.steps, len(one.flat)) for one in recordings] == [
         (seed, 2, 2 * len(get_task("block_to_bin").action_names)) for seed in (7, 8)
     ]
+
+
+def test_a_worker_records_where_its_user_says_and_not_where_its_server_was_told(monkeypatch):
+    monkeypatch.setenv(FOLDER, "of an earlier time")
+    assert recording_into("now", lambda: os.environ[FOLDER]) == "now"
+    assert recording_into(None, lambda: os.environ.get(FOLDER)) is None
 
 
 def test_what_cannot_be_recorded_is_refused(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from lerobot.envs.utils import check_env_attributes_and_types, preprocess_observ
 from lerobot_constructskill.contract import REWARD_LIFTED
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
+from lerobot_constructskill.errors import InputError
 
 KWARGS = {"task": "block_to_bin", "obs_type": "pixels_agent_pos", "episode_length": 4}
 ACTIONS = np.random.default_rng(0).uniform(-0.03, 0.03, size=(6, 1, 4)).astype(np.float32)
@@ -94,3 +95,13 @@ def test_an_ended_episode_freezes_while_the_others_go_on(monkeypatch):
     vector.reset(seed=[1, 2, 3])
     assert vector._env.options == {"reconfigure": True}, "PhysX would keep the contacts of the last episode"
     assert vector.call("task_description") == (vector._single.task_description,) * 3
+
+
+def test_what_it_cannot_do_is_refused():
+    with pytest.raises(InputError, match="vectorization=process"):
+        NativeVectorEnv(1, perturb="sensor=3")
+    with pytest.raises(InputError, match="1 environments need as many seeds, not 2"):
+        NativeVectorEnv(1).reset(seed=[1, 2])
+    for use in (NativeVectorEnv.render, lambda vector: vector.step(ACTIONS[0])):
+        with pytest.raises(RuntimeError, match="reset"):
+            use(NativeVectorEnv(1))

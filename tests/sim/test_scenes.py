@@ -12,6 +12,7 @@ from mani_skill.utils.structs import Pose
 
 import lerobot_constructskill.sim.register  # noqa: F401
 from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
@@ -218,6 +219,20 @@ def test_bricks_of_another_size_have_to_be_as_flush_as_any():
         assert env.object_size != type(env).object_size and env.bin_floor == env.object_size[2]
         np.testing.assert_allclose(env.play, TOLERANCE)
         env.close()
+
+
+def test_a_brick_too_large_for_its_bin_is_refused_of_maniskills_users_too():
+    with pytest.raises(InputError, match="too large for the bin, 5 mm larger than"):
+        make("brick_to_bin_5mm", perturbation=Perturbation("size=2"))
+
+
+def test_a_pose_is_drawn_anew_by_every_reset_and_by_its_seed_where_it_has_one():
+    env, drawn = make("brick_to_bin", perturbation=Perturbation("pose=3")), []
+    for seed in (5, None, None, 5, None):
+        env.reset(seed=seed)
+        drawn.append(tuple(env.agent.robot.get_qpos()[0, :7].tolist()))
+    assert drawn[3:] == drawn[:2] and len(set(drawn)) == 3
+    env.close()
 
 
 def test_a_brick_that_leans_on_the_rim_is_placed_as_the_paper_counts_and_not_strictly():

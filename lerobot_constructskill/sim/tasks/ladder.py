@@ -3,7 +3,7 @@
 from mani_skill.utils.registration import register_env
 
 from lerobot_constructskill.contract import LADDER, TASKS
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.sim.perturb import check_fits
 from lerobot_constructskill.sim.precise import PreciseEnv
 from lerobot_constructskill.sim.tasks.brick import BrickToBinEnv
 
@@ -36,12 +36,7 @@ class BrickLadderEnv(PreciseEnv, BrickToBinEnv):
         x, y, _ = self.object_size
         self.bin_interior = (x + clearance, y + clearance, BIN_DEPTH)
         super().__init__(*args, **kwargs)
-        if min(self.play) < 0:
-            x, y = (f"{1000 * edge:.1f}" for edge in self.object_size[:2])
-            raise InputError(
-                f"This draw of size makes a brick of {x} x {y} mm, which is too large for the bin, "
-                f"{1000 * clearance:g} mm larger than the usual brick: name another perturb_seed."
-            )
+        check_fits(self.object_size, clearance)
 
 
 for _name, _clearance in LADDER.items():
