@@ -240,6 +240,18 @@ def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, mon
         make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
 
 
+def test_features_of_pretrained_weights_are_not_those_of_random_ones(encoded, weights, monkeypatch):
+    """They are drawn otherwise here than those that stand in for pretrained ones."""
+    other = load_file(weights)
+    other[min(other)] += 1
+    monkeypatch.setattr(weights_module, "_random_state", lambda backbone: other)
+    asked = FrozenViTChunkConfig(
+        backbone="vit_tiny16", backbone_path=str(weights), backbone_pretrained=False, device="cpu"
+    )
+    with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
+        make_policy(asked, ds_meta=encoded.meta)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("patches", [False, True])
 def test_an_interrupted_run_continues_with_its_next_episode(patches, source, weights, encoded, tmp_path, monkeypatch):

@@ -146,8 +146,18 @@ def test_a_random_backbone_that_is_drawn_otherwise_is_refused(make_policy, tmp_p
         FrozenViTChunkPolicy.from_pretrained(tmp_path)
 
 
-@pytest.mark.parametrize(("name", "value"), [("readout", "mean"), ("crop", (0.1, 0.1, 0.9, 0.9)), ("blind", True)])
-def test_heads_are_not_shown_what_they_were_not_trained_on(name, value, make_policy, tmp_path):
+OTHERWISE = {
+    "readout": "mean",
+    "crop": (0.1, 0.1, 0.9, 0.9),
+    "blind": True,
+    "backbone": "vit_tiny16_augreg",
+    "gripper_head": "regression",
+    "action_scale": 0.01,
+}
+
+
+@pytest.mark.parametrize(("name", "value"), OTHERWISE.items())
+def test_heads_are_not_shown_what_they_were_not_trained_on_nor_read_otherwise(name, value, make_policy, tmp_path):
     make_policy().save_pretrained(tmp_path)
     config = PreTrainedConfig.from_pretrained(tmp_path)
     setattr(config, name, value)

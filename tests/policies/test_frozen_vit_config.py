@@ -29,6 +29,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"action_scale": 0.0}, "above 0 m and rad .* not 0.0"),
         ({"crop": [0.5, 0.0, 0.2, 1.0]}, r"left, top, right and bottom .* got \[0.5, 0.0, 0.2, 1.0\]"),
         ({"crop": [0.1, 0.9]}, r"got \[0.1, 0.9\]"),
+        ({"crop": [0.5, 0.5, 0.501, 0.501]}, "at least two pixels of 224 apart"),
         ({"head_hidden_dim": 0}, "from 1 to .*, not 0"),
         ({"head_hidden_layers": 0}, "from 1 to 16, not 0"),
         ({"regression_loss": "huber"}, "mse, l1"),

@@ -207,6 +207,13 @@ def test_standardised_features_are_the_same_linear_heads_in_other_units(make_pol
     torch.testing.assert_close(again.predict_action_chunk(moved), standardised.predict_action_chunk(moved))
 
 
+def test_a_channel_that_no_frame_of_the_training_set_excites_is_not_magnified(make_policy):
+    std = torch.ones(make_policy().backbone.spec.feature_dim)
+    std[:3] = torch.tensor([0.0, 1e-9, 1e-5])
+    stats = {"observation.features.base": {"mean": torch.zeros_like(std), "std": std}}
+    assert (make_policy(standardize_features=True, dataset_stats=stats).feature_std == 1).all()
+
+
 def test_standardised_features_need_statistics(make_policy):
     with pytest.raises(ValueError, match="constructskill-encode"):
         make_policy(standardize_features=True)

@@ -11,7 +11,9 @@ import torch
 from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit import precision as precision_module
+from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, WITHOUT_BFLOAT16, native_precision
 
@@ -99,3 +101,8 @@ def test_under_the_other_kinds_instructions_float32_is_close_to_ours(weights, im
     encoder, info = load_encoder("vit_tiny16", str(weights("vit_tiny16")), "float32")
     assert done.stdout.split() == ["float32", info["runtime"]]
     torch.testing.assert_close(torch.load(files[1]), encoder(images), atol=1e-4, rtol=0)
+
+
+def test_a_blind_encoder_drifts_as_far_as_its_features_of_grey(images):
+    encoder = FrozenEncoder(BACKBONES["vit_tiny16"], "float32", blind=True)
+    assert encoder.drift(images, "float32") < 1e-3

@@ -6,7 +6,15 @@ import logging
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from transformers import CLIPConfig, CLIPVisionConfig, Dinov2Config, ResNetConfig, SiglipVisionConfig, ViTConfig
+from transformers import (
+    CLIPConfig,
+    CLIPVisionConfig,
+    Dinov2Config,
+    ResNetConfig,
+    SiglipVisionConfig,
+    ViTConfig,
+    ViTMAEConfig,
+)
 
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.policies.frozen_vit import zoo
@@ -101,11 +109,16 @@ def test_what_cannot_be_had_is_one_sentence(tmp_path, monkeypatch, caplog):
     caplog.set_level(logging.INFO)
     (tmp_path / "config.json").write_text("{}")
     (tmp_path / "preprocessor_config.json").write_text("{}")
+    describe(tmp_path / "masked", ViTMAEConfig(**SMALL))
+    describe(tmp_path / "larger", ViTConfig(**SMALL, image_size=384))
     for name, path, error, said in (
         ("timm/nothing_of_the_kind", None, ValueError, "timm has no model 'nothing_of_the_kind'"),
+        ("timm/resnet18.another_tag", None, ValueError, "timm has no model 'resnet18.another_tag'"),
         ("timm/mobilenetv3_large_100", None, ValueError, "pools 1280 numbers of patches of 960"),
         ("hf/somebody/model", None, FileNotFoundError, r"has no config.json.*hf download somebody/model"),
         ("hf/somebody/model", tmp_path, ValueError, "describes no model that transformers knows"),
+        ("hf/somebody/model", tmp_path / "masked", ValueError, "encodes a random part of every image"),
+        ("hf/somebody/model", tmp_path / "larger", ValueError, r"does not encode one image of 224 x 224 \(Input"),
     ):
         with pytest.raises(error, match=said) as refusal:
             get_backbone(name, path and str(path))

@@ -264,14 +264,15 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 
 
 def check_crop(crop: list[float] | None) -> None:
-    """Refuse edges that enclose no part of an image."""
+    """Refuse edges that enclose no pixels of an image."""
     if crop is None:
         return
     left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
-    if not (0 <= left < right <= 1 and 0 <= top < bottom <= 1):
+    least = 2 / IMAGE_SIZE  # of one pixel nothing may be left, where its edges are rounded
+    if not (0 <= left <= right - least <= 1 - least and 0 <= top <= bottom - least <= 1 - least):
         raise InputError(
-            f"crop must be left, top, right and bottom in shares of the image, such as [0.25, 0.25, 0.75, 0.75]; "
-            f"got {crop}."
+            f"crop must be left, top, right and bottom in shares of the image, at least two pixels of "
+            f"{IMAGE_SIZE} apart, such as [0.25, 0.25, 0.75, 0.75]; got {crop}."
         )
 
 

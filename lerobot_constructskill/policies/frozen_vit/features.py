@@ -63,7 +63,7 @@ def describe(
     resize = f"bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size"
     pixels = ["[0, 1]", resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
     if crop is not None:
-        pixels.insert(1, f"crop {list(crop)}")
+        pixels.insert(1, f"crop {[float(edge) for edge in crop]}")
     if blind:
         pixels.insert(0, "grey in place of the image")
     return {

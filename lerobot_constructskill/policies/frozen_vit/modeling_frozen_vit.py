@@ -27,6 +27,8 @@ from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
+SILENT = 1e-3
+"""A feature whose standard deviation is below this share of the median one is not divided by it."""
 logger = logging.getLogger(__name__)
 
 
@@ -232,7 +234,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             if config.backbone_sha256 is not None:
                 raise
             # Any weights, for `check_features` to say all that differs from the data set's encoder.
-            state, source = load_weights(self.backbone.spec, config.backbone_path)
+            state, source = load_weights(self.backbone.spec, config.backbone_path, pretrained=pretrained)
         self.backbone.model.load_state_dict(state)
         config.backbone_source, config.backbone_sha256 = source, state_sha256(state)
 
@@ -244,12 +246,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 "which constructskill-encode makes of the data set."
             )
         self.feature_mean.copy_(torch.as_tensor(stats["mean"]))
-        self.feature_std.copy_(torch.as_tensor(stats["std"]).clamp(min=1e-6))
+        std = torch.as_tensor(stats["std"], dtype=torch.float32)
+        # A channel that is the same in every frame says nothing, and divided by its spread would say anything later.
+        self.feature_std.copy_(torch.where(std > SILENT * std.median().clamp(min=1e-3), std, 1))
 
     def _check_inputs(self, path: Path) -> None:
-        """Refuse what would show the heads other numbers of the same shape than they were trained on."""
+        """Refuse what would make other numbers of the same shape of the heads' input or output than in training."""
         saved = json.loads(path.read_text()) if path.is_file() else {}
-        for name in ("readout", "crop", "blind"):
+        for name in ("backbone", "readout", "crop", "blind", "gripper_head", "action_scale"):
             asked = getattr(self.config, name)
             asked = list(asked) if isinstance(asked, tuple) else asked
             if asked != (trained := saved.get(name, asked)):

@@ -9,6 +9,7 @@ import os.path
 import re
 from collections.abc import Callable
 from functools import cache, partial
+from math import isqrt
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,10 @@ def find(name: str, path: str | None = None) -> Backbone:
 def _from_timm(name: str, model: str, revision: str) -> Backbone:
     import timm
 
-    facts = timm.get_pretrained_cfg(model) if timm.is_model(model) else None
+    try:
+        facts = timm.get_pretrained_cfg(model) if timm.is_model(model) else None
+    except RuntimeError:  # another tag of a model that it has
+        facts = None
     if facts is None:
         raise InputError(f"timm has no model '{model}'; `timm.list_models()` lists its models.")
     build = partial(_build_timm, model)
@@ -92,6 +96,8 @@ def _from_transformers(name: str, repo_id: str, revision: str, path: str | None)
     except (OSError, ValueError, KeyError) as error:
         said = first_line(error)
         raise InputError(f"'{path or repo_id}' describes no model that transformers knows ({said}).") from None
+    if getattr(config, "mask_ratio", 0):
+        raise InputError(f"{name} encodes a random part of every image (mask_ratio {config.mask_ratio}).")
     build = partial(_build_transformers, getattr(config, "vision_config", config))
     model = _on_meta(build)
     return Backbone(
@@ -148,13 +154,15 @@ def _layout(name: str, model: nn.Module, encode: Encode) -> dict[str, Any]:
     try:
         with torch.device("meta"):
             pooled, patches = encode(model, torch.empty(1, 3, IMAGE_SIZE, IMAGE_SIZE))
-    except (RuntimeError, AssertionError, AttributeError, TypeError) as error:
+    except (RuntimeError, AssertionError, AttributeError, TypeError, ValueError) as error:
         said = first_line(error)
         raise InputError(f"{name} does not encode one image of {IMAGE_SIZE} x {IMAGE_SIZE} ({said}).") from None
     if pooled.shape[1:] != patches.shape[2:]:
         raise InputError(
             f"{name} pools {pooled.shape[-1]} numbers of patches of {patches.shape[-1]}; these must be equal."
         )
+    if isqrt(patches.shape[1]) ** 2 != patches.shape[1]:
+        raise InputError(f"{name} has {patches.shape[1]} patches, which are no square grid.")
     return {"feature_dim": pooled.shape[-1], "n_patches": patches.shape[1], "readout": "pooled_by_its_configuration"}
 
 
