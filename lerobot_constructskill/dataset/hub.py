@@ -1,6 +1,7 @@
 """Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
 
 import json
+import logging
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from math import ceil
@@ -8,13 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_constructskill.artifacts.digests import data_sha256
-from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.artifacts.store import SPEC
+from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
 from lerobot_constructskill.dataset.frames import packet_times
 from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, plural
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
+
+logger = logging.getLogger(__name__)
 
 PUSHED = [
     "README.md",
@@ -26,6 +30,12 @@ PUSHED = [
     "videos/*.mp4",
 ]
 """What leaves the machine; `*` stands for folders as well."""
+
+INFO = "meta/info.json"
+"""What makes a folder a data set of LeRobot's."""
+
+UNTOUCHED = {".gitattributes"}
+"""What the Hub itself puts into a new repository."""
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
@@ -112,6 +122,8 @@ def choose_held_out(
 ) -> list[int]:
     """The episodes that were named, or those that the contract holds out, if no checkpoint was trained on them.
 
+    Where it cannot be told what a checkpoint was trained on, a line says so.
+
     Raises:
         InputError: there are none, the data set has not all of them, or a checkpoint has seen one that nobody named.
     """
@@ -119,7 +131,9 @@ def choose_held_out(
     if not chosen or not set(chosen) <= set(range(dataset.num_episodes)):
         raise InputError(f"Held-out episodes must be among 0 to {dataset.num_episodes - 1}, not {chosen}.")
     for checkpoint in checkpoints if episodes is None else ():
-        if seen := sorted(trained_on(Path(checkpoint), dataset) & set(chosen)):
+        if (learnt := trained_on(Path(checkpoint), dataset)) is None:
+            logger.warning("Whether '%s' was trained on the held-out episodes %s cannot be told.", checkpoint, chosen)
+        elif seen := sorted(learnt & set(chosen)):
             raise InputError(
                 f"'{checkpoint}' was trained on {plural(len(seen), 'episode')} of those that are held out by default, "
                 f"episode {seen[0]} for one: name others by --episodes, or the same to see their error all the same."
@@ -127,31 +141,42 @@ def choose_held_out(
     return chosen
 
 
-def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int]:
+def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     """The episodes of a data set that a checkpoint in a folder says it was trained on, or on their features.
 
-    None if `lerobot-train` did not make it. Of those that it is given LeRobot keeps the last for its own evaluation, a
-    share `eval_split` rounded up.
+    None if it cannot be told: it lies on the Hub, or its training set is not where it was. Of the episodes that it is
+    given LeRobot keeps the last for its own evaluation, a share `eval_split` rounded up. A study and DAgger say how
+    much they hold out, and not of which folder.
     """
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
+
     path = checkpoint / TRAIN_CONFIG
-    told = json.loads(path.read_text()).get("dataset", {}) if path.is_file() else {}
-    folder = Path(told["root"]) if told.get("root") else None
-    sources = _sources(folder) if folder else []
+    if not path.is_file():
+        return set() if _holds_out_as_the_contract(checkpoint) else None
+    told = json.loads(path.read_text()).get("dataset", {})
+    folder = Path(told["root"]) if told.get("root") else HF_LEROBOT_HOME / told.get("repo_id", "")
+    sources = _sources(folder)
     is_it = (
         dataset.repo_id in (told.get("repo_id"), *(source["source_repo_id"] for source in sources))
-        or (folder is not None and folder.resolve() == dataset.root.resolve())
+        or folder.resolve() == dataset.root.resolve()
         # Last, for it reads every file: a copy may have another name.
         or any(source["source_sha256"] == data_sha256(dataset.root) for source in sources)
     )
     if not is_it:
-        return set()
+        return set() if (folder / INFO).is_file() else None
     given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
     return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
 
 
+def _holds_out_as_the_contract(checkpoint: Path) -> bool:
+    path = checkpoint / SPEC
+    told = json.loads(path.read_text()) if path.is_file() else {}
+    return told.get("training", {}).get("holdout") == HELD_OUT_EVERY
+
+
 def _sources(root: Path) -> list[dict[str, str]]:
     """What a feature set that lies in a folder says of the data set whose features it holds."""
-    path = root / "meta" / "info.json"
+    path = root / INFO
     features = json.loads(path.read_text())["features"] if path.is_file() else {}
     infos = [feature.get("info") or {} for feature in features.values()]
     return [info for info in infos if "source_repo_id" in info]
@@ -221,14 +246,14 @@ def check_private(repo_id: str, repo_type: str = "model") -> None:
 
 
 def _is_cut(root: Path, **repo: str) -> bool:
-    """Whether a repository without LeRobot's tag holds no data set but that in `root`, whose push was interrupted."""
+    """Whether a repository without LeRobot's tag holds nothing but the set in `root`, whose push was interrupted."""
     from huggingface_hub import HfApi
 
-    api, info = HfApi(), "meta/info.json"
-    held = {path for path in api.list_repo_files(**repo) if path.startswith(("data/", "meta/", "videos/"))}
-    if info not in held:
+    api = HfApi()
+    held = set(api.list_repo_files(**repo)) - UNTOUCHED
+    if INFO not in held:
         return not held
-    return Path(api.hf_hub_download(**repo, filename=info)).read_bytes() == (root / info).read_bytes()
+    return Path(api.hf_hub_download(**repo, filename=INFO)).read_bytes() == (root / INFO).read_bytes()
 
 
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:

@@ -214,10 +214,13 @@ def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDatase
     return LeRobotDataset(dataset.repo_id, root=dataset.root, revision=dataset.revision, delta_timestamps=times)
 
 
-def policy_errors(agent: PolicyAgent, dataset: LeRobotDataset, episode: int, phases: list[str]) -> np.ndarray:
+def policy_errors(
+    agent: PolicyAgent, dataset: LeRobotDataset, episode: int, phases: list[str], labels: str
+) -> np.ndarray:
     """The policy's translation minus the expert's, on the expert's own states, while the phase is one of `phases`.
 
-    A policy that samples its actions draws them from the episode's number and the step.
+    A policy that samples its actions draws them from the episode's number and the step. The expert is the one that
+    the policy learns from: that of the `labels`, or where they are what was executed, the one that acted.
 
     Returns:
         (n, 3) in metres
@@ -230,7 +233,8 @@ def policy_errors(agent: PolicyAgent, dataset: LeRobotDataset, episode: int, pha
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
         if frame["phase"] in phases:
-            errors.append((action - _clean_action(frame).numpy())[:3])
+            wanted = frame["action"] if labels == "advice" else _clean_action(frame)
+            errors.append((action - wanted.numpy())[:3])
     return np.array(errors, dtype=np.float64).reshape(-1, 3)
 
 

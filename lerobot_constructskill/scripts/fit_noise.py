@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from lerobot_constructskill.bounds import Device, Episodes, Range, RepoId, Text, check
-from lerobot_constructskill.errors import plural
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
 
@@ -34,7 +37,8 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     Raises:
         FileNotFoundError: the data set or the policy is not there.
-        ValueError: no such episodes, nothing to fit on, or a policy with other actions or observations.
+        ValueError: no such episodes, none in which the expert drives, nothing to fit on, or a policy with other
+            actions or observations.
     """
     import numpy as np
     import yaml
@@ -52,14 +56,15 @@ def fit_noise(config: FitNoiseConfig) -> str:
 
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
-    episodes = choose_held_out(dataset, config.episodes, [config.policy_path])
+    episodes = _by_the_expert(dataset, choose_held_out(dataset, config.episodes, [config.policy_path]))
     with one_sentence(config.policy_path):
         device = config.device or str(auto_select_torch_device())
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     bar = Progress(episodes, "demonstrations", unit="demo")
     with shown(dataset):
-        errors = [policy_errors(agent, dataset, episode, generator["noise"]["phases"]) for episode in bar]
+        noisy, labels = generator["noise"]["phases"], generator["labels"]
+        errors = [policy_errors(agent, dataset, episode, noisy, labels) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)
     fitted_on = {
         "policy": config.policy_path,
@@ -75,6 +80,17 @@ def fit_noise(config: FitNoiseConfig) -> str:
     config.out.write_text(f"# DART iteration {fitted_on['iteration']}.\n{yaml.safe_dump(generator, sort_keys=False)}")
     deviations = ", ".join(f"{1000 * value:.2f}" for value in np.sqrt(np.diag(covariance)))
     return f"Noise of {deviations} mm (x, y, z) from {plural(int(fitted_on['frames']), 'frame')}: {config.out}"
+
+
+def _by_the_expert(dataset: "LeRobotDataset", episodes: list[int]) -> list[int]:
+    """Those in which the expert drives: in DAgger's rounds the states are the learner's."""
+    if "dagger.round" not in dataset.meta.features:
+        return episodes
+    first = {episode: dataset.meta.episodes[episode]["dataset_from_index"] for episode in episodes}
+    by_expert = [episode for episode in episodes if not dataset.hf_dataset[first[episode]]["dagger.round"]]
+    if not by_expert:
+        raise InputError(f"In episodes {episodes} a learner drives: noise is fitted to errors in the expert's states.")
+    return by_expert
 
 
 def main() -> None:

@@ -209,6 +209,21 @@ def test_a_refused_push_is_one_sentence_and_makes_nothing(name, options, words, 
     assert f"datasets/{name}" not in hub.repos
 
 
+def test_what_somebody_else_keeps_under_a_name_is_not_written_over(hub, machine, pristine, tmp_path):
+    (tmp_path / "README.md").write_text("Another set, in a format of its own.")
+    machine(upload, tmp_path, "alice/tables")
+    assert "--update" in refusal(machine, push, pristine, "alice/tables")
+    repo = hub.repos["datasets/alice/tables"]
+    assert list(repo.commits[repo.branches["main"]]) == ["README.md"]
+
+
+def upload(folder, repo_id):
+    from huggingface_hub import HfApi
+
+    HfApi().create_repo(repo_id, repo_type="dataset")
+    HfApi().upload_folder(repo_id=repo_id, repo_type="dataset", folder_path=folder)
+
+
 def test_a_pull_that_cannot_be_is_one_sentence(hub, machine, pristine):
     machine(push, pristine, "alice/private", private=True)
     assert "no 'alice/nothing' that this machine may see" in refusal(machine, pull, "alice/nothing")

@@ -13,12 +13,20 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_constructskill.artifacts.digests import data_sha256
+from lerobot_constructskill.artifacts.store import SPEC
 from lerobot_constructskill.dataset import hub
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.offline import Predictions, check_actions, offline_metrics, predict, shown
+from lerobot_constructskill.rollout.offline import (
+    Predictions,
+    check_actions,
+    offline_metrics,
+    policy_errors,
+    predict,
+    shown,
+)
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
 EPISODES, CHUNK = [3, 7], 5
@@ -208,6 +216,55 @@ def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_pa
         asked = SimpleNamespace(repo_id=repo_id, num_episodes=4, root=tmp_path / root)
         assert hub.trained_on(tmp_path, asked) == episodes
         assert not hub.trained_on(tmp_path / "nothing", asked)
+
+
+def test_of_a_checkpoint_that_says_nothing_of_its_training_set_a_line_is_said(tmp_path, monkeypatch, caplog):
+    home = tmp_path / "home"
+    (home / "alice" / "encoded" / "meta").mkdir(parents=True)
+    column = {"info": {"source_repo_id": "alice/set", "source_sha256": "0"}}
+    (home / "alice" / "encoded" / "meta" / "info.json").write_text(json.dumps({"features": {"a": column}}))
+    monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", home)
+    asked = SimpleNamespace(repo_id="alice/set", num_episodes=16, root=tmp_path / "nothing")
+    for number, (file, told, seen) in enumerate(
+        (
+            (TRAIN_CONFIG, {"dataset": {"repo_id": "alice/encoded", "root": None}}, set(range(16))),
+            (TRAIN_CONFIG, {"dataset": {"repo_id": "alice/encoded", "root": "gone"}}, None),
+            (SPEC, {"training": {"holdout": 8}}, set()),
+            (SPEC, {"training": {"holdout": 5}}, None),
+            ("no_file", {}, None),
+        )
+    ):
+        checkpoint = tmp_path / str(number)
+        checkpoint.mkdir()
+        (checkpoint / file).write_text(json.dumps(told))
+        assert hub.trained_on(checkpoint, asked) == seen, told
+        caplog.clear()
+        with pytest.raises(InputError) if seen else nullcontext():
+            assert hub.choose_held_out(asked, None, [checkpoint]) == [7, 15]
+        assert [record.getMessage() for record in caplog.records] == (
+            [f"Whether '{checkpoint}' was trained on the held-out episodes [7, 15] cannot be told."] * (seen is None)
+        )
+
+
+def test_a_policy_that_says_what_its_labels_say_has_no_errors():
+    """Whichever expert they are of: with noise, without, or with the advice from the state alone."""
+    clean, noise, advice = np.float32([0.01, 0, -0.02, 1]), np.float32([0.003, 0.001, 0]), np.float32([0, 0, 0.03, -1])
+    executed = clean + np.append(noise, np.float32(0))
+    for labels, action in (("clean", clean), ("executed", executed), ("advice", advice)):
+        wanted = clean if labels == "executed" else action
+        columns = {"action": action, "dart.executed_action": executed, "dart.noise": noise}
+        frame = {name: torch.from_numpy(value) for name, value in columns.items()} | {"task": "", "phase": "CARRY"}
+        row = {"dataset_from_index": 0, "dataset_to_index": 2}
+        agent = SimpleNamespace(
+            reset=lambda episode: None, preprocessor=as_it_is, decide=lambda batch, wanted=wanted: wanted
+        )
+        dataset = FakeDataset([frame] * 2)
+        dataset.meta = SimpleNamespace(episodes=[row])
+        np.testing.assert_allclose(policy_errors(agent, dataset, 0, ["CARRY"], labels), np.zeros((2, 3)), atol=1e-9)
+
+
+class FakeDataset(list):
+    """Frames, and a place for what is said of them."""
 
 
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
