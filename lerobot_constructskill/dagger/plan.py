@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
@@ -13,7 +12,7 @@ from lerobot_constructskill.contract import Task, get_task
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.obtain import artifact
-from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse_named
@@ -48,18 +47,8 @@ class Plan:
 
     def _check_starts(self, base: GenerateConfig) -> None:
         """Refuse a start that two of demonstrations, rounds and evaluation would have."""
-        attempts = base.episodes + int(base.max_failures * base.episodes)
-        starts = {
-            "demonstrations": range(base.seed_start, base.seed_start + attempts),
-            "rounds": range(self.seeds(1).start, self.seeds(self.config.rounds).stop),
-            "evaluation": self.eval_seeds,
-        }
-        for (one, these), (other, those) in combinations(starts.items(), 2):
-            if max(these.start, those.start) < min(these.stop, those.stop):
-                raise InputError(
-                    f"The {one} may have starts {these.start} to {these.stop - 1} and the {other} {those.start} to "
-                    f"{those.stop - 1}: no start may be in both (--seed_start, --eval_seed)."
-                )
+        rounds = range(self.seeds(1).start, self.seeds(self.config.rounds).stop)
+        check_apart({"demonstrations": base.starts, "rounds": rounds, "evaluation": self.eval_seeds})
 
     @cached_property
     def policy(self) -> PreTrainedConfig:

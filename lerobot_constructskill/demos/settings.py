@@ -1,6 +1,8 @@
 """What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from itertools import combinations
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.digests import digest, versions
@@ -11,6 +13,7 @@ from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.video import VIDEOS
+from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed", "advice")
 
@@ -71,6 +74,21 @@ class GenerateConfig:
     def __post_init__(self):
         check(self)
         get_task(self.task)
+
+    @property
+    def starts(self) -> range:
+        """Seeds of all attempts that it may take."""
+        return range(self.seed_start, self.seed_start + self.episodes + int(self.max_failures * self.episodes))
+
+
+def check_apart(starts: Mapping[str, range]) -> None:
+    """Raise InputError where two of some uses, each with the seeds of its starts, would have one start."""
+    for (one, these), (other, those) in combinations(starts.items(), 2):
+        if max(these.start, those.start) < min(these.stop, those.stop):
+            raise InputError(
+                f"The {one} may have starts {these.start} to {these.stop - 1} and the {other} {those.start} to "
+                f"{those.stop - 1}: no start may be in both (seed_start, eval_seed)."
+            )
 
 
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.obtain import artifact
-from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
@@ -218,6 +218,12 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
         base = f"{data.name} --seed_start={data.config.seed_start}" if data.moved else data.name
         start = rounds.seed_start + data.moved
         learnt["dagger"] = replace(rounds, base=base, seed_start=start, policy=variant.policy, training=training)
+    with _inside(f"variants.{name}"):
+        first = study.eval_seed
+        starts = {"demonstrations": data.config.starts, "evaluation": range(first, first + study.episodes)}
+        if variant.dagger:
+            starts["rounds"] = range(start, start + rounds.rounds * rounds.episodes)
+        check_apart(starts)
     elsewhere = (_variant_arm(study, name, replace(variant, policy=other), data, common) for other in others)
     return Arm(name=name, role=VARIANT, elsewhere=tuple(elsewhere), **learnt, **common)
 

@@ -563,6 +563,11 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"references": {"random": 0}}, "references.random: seeds must be a whole number from 1"),
         ({"episodes": 0}, "episodes must be a whole number from 1"),
         ({"eval_seed": -1}, "eval_seed must be a whole number from 0"),
+        ({"eval_seed": 999_999}, "variants.a: The demonstrations may have starts 1000000 .* no start may be in both"),
+        (
+            {"variants": {"a": Variant({"type": "frozen_vit"}, dagger="smoke")}, "eval_seed": 2_000_000},
+            "variants.a: The evaluation may have starts 2000000 .* and the rounds 2000000",
+        ),
         ({"settings": {"fixed": Setting("smoke", {"episode_length": 8})}}, "variants.a.policy: .*obs_type"),
         ({"settings": {"fixed": Setting("smoke", {"task": "brick"})}}, "settings.fixed.env: Unknown task 'brick'"),
         ({"settings": {"fixed": Setting("smoke", ENV, training={"epoch": 5})}}, "settings.fixed.training: .*epoch"),
