@@ -10,6 +10,7 @@ from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
+from lerobot_constructskill.errors import InputError
 
 Version = Annotated[str, Pattern(r"[\w.+!-]{1,64}", "a version")]
 
@@ -62,6 +63,8 @@ def card_facts(data: DataSet) -> dict[str, Any]:
         InputError: the data set says of itself what none can.
     """
     check_values(Provenance, data.facts, f"{SIDECAR}: ")
+    if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
+        raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     lengths = [span.stop - span.start for span in data.spans()]
     experts = data.rounds == 0
     phases, noise = data.column("phase")[experts], data.column("dart.noise")[experts]
@@ -87,11 +90,19 @@ def card_facts(data: DataSet) -> dict[str, Any]:
             }
             for phase in Phase
         },
-        "action_range": {
-            name: [round(float(data.stats["action"][edge][index]), 4) for edge in ("q01", "q99")]
-            for index, name in enumerate(data.info["features"]["action"]["names"])
-        },
+        "action_range": _action_range(data),
     }
+
+
+def _action_range(data: DataSet) -> dict[str, list[float]]:
+    """Name of an action's number to its first and last percentile."""
+    try:
+        names = data.info["features"]["action"]["names"]
+        edges = np.array([data.stats["action"][edge] for edge in ("q01", "q99")], dtype=float)
+        named = list(zip(names, edges.T, strict=True))
+    except (KeyError, TypeError, ValueError, IndexError):
+        raise InputError("meta/stats.json has not one q01 and q99 for each name of action in info.json.") from None
+    return {name: [round(float(edge), 4) for edge in both] for name, both in named}
 
 
 def render(facts: dict[str, Any]) -> str:

@@ -254,6 +254,9 @@ def check_provenance(data: DataSet) -> Iterator[str]:
         yield "The seeds of the episodes and the discarded ones are not those of the attempts, one by one."
     if seeds != sorted(seeds):
         yield "The episodes are not in the order of their seeds."
+    covariance = data.config.noise.root @ data.config.noise.root
+    if not _is_close(data.facts["noise_covariance"], covariance):
+        yield f"noise_covariance is {data.facts['noise_covariance']}; of the settings it is {covariance.tolist()}."
     missing = set(FRAME_PACKAGES) - data.facts["versions"].keys()
     if missing:
         yield f"The versions of {', '.join(sorted(missing))} are not recorded."

@@ -108,10 +108,14 @@ def pictures(data: DataSet, camera: str) -> Iterator[tuple[int, np.ndarray]]:
         try:
             with av.open(str(path)) as video:
                 for frame in video.decode(video=0):
+                    if row == len(data.rows):
+                        raise InputError(f"The videos of {camera} have more frames than the data set has rows.")
                     yield row, frame.to_ndarray(format="rgb24")
                     row += 1
         except (av.FFmpegError, IndexError) as error:
             raise InputError(f"{path.relative_to(data.root)} cannot be decoded ({error}).") from None
+    if row < len(data.rows):
+        raise InputError(f"The videos of {camera} have {row} frames, but the data set has {len(data.rows)} rows.")
 
 
 FRAME_CHECKS = {"Videos": check_videos, "Pictures": check_pictures}

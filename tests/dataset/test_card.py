@@ -17,10 +17,11 @@ from lerobot_constructskill.contract import CAMERAS, FPS, TASKS
 from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos import shards
-from lerobot_constructskill.demos.columns import dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import modality
 from lerobot_constructskill.demos.settings import GenerateConfig
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.generate import generate
 
 CARDS = Path(__file__).parents[2] / "datasets_cards"
@@ -110,6 +111,32 @@ def test_the_command_writes_a_card_with_its_pictures(copy, tmp_path):
     assert card == render(json.loads((tmp_path / "facts.json").read_text()))
     for name in re.findall(r"\((pictures/\w+\.png)\)", card):
         assert np.asarray(Image.open(copy / name)).std() > 10
+
+
+def emptied(root, file, change):
+    facts = json.loads((root / file).read_text())
+    change(facts)
+    (root / file).write_text(json.dumps(facts))
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        ("meta/stats.json", lambda stats: stats.update(action=[]), "for each name of action"),
+        ("meta/stats.json", lambda stats: stats["action"].update(q01=None), "for each name of action"),
+        (
+            "meta/stats.json",
+            lambda stats: stats["action"].update(q99=[1.0]),
+            "for each name of action",
+        ),
+        ("meta/info.json", lambda info: info["features"]["action"].update(names=None), "for each name of action"),
+        (SIDECAR, lambda facts: facts.update(noise_covariance=[]), r"must be 3 x 3, not \[\]"),
+    ],
+)
+def test_a_card_of_metadata_without_its_numbers_is_refused_in_one_sentence(file, change, said, copy):
+    emptied(copy, file, change)
+    with pytest.raises(InputError, match=said):
+        card_facts(open_dataset(copy))
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,11 @@ CORRUPTIONS = {
     "a late time stamp": (column("timestamp", at(9, 0.5)), "Time stamps", "worst by 0.0500 s"),
     "a video read too late": (late_video, "Videos", "which do not follow on frame 0"),
     "a dropped video frame": (frames(lambda pictures: pictures[:-1]), "Videos", "frames, but its episodes have"),
+    "a video frame too many": (
+        frames(lambda pictures: [*pictures, pictures[-1]]),
+        "Pictures",
+        "have more frames than",
+    ),
     "a truncated video": (truncate(VIDEO), "Videos", "cannot be read"),
     "black pictures": (frames(black), "Pictures", "observation.images.base shows nothing in 10 frames, first 300"),
     "a frozen camera": (frames(frozen), "Pictures", "while the arm moves, first"),
@@ -208,6 +213,11 @@ CORRUPTIONS = {
     "a video that was given up": (without_statistics, "Statistics", "Episodes 3 have no statistics of .*base"),
     "a hidden failure": (metadata(SIDECAR, lambda f: f.update(discarded_seeds=[])), "Provenance", "the attempts"),
     "an unnamed version": (metadata(SIDECAR, lambda f: f["versions"].pop("sapien")), "Provenance", "sapien"),
+    "a covariance that was not drawn from": (
+        metadata(SIDECAR, lambda facts: facts.update(noise_covariance=[[1e-6, 0, 0], [0, 1e-6, 0], [0, 0, 1e-6]])),
+        "Provenance",
+        "of the settings it is",
+    ),
     "no modality": (lambda root: (root / "meta/modality.json").unlink(), "Provenance", "modality.json"),
 }
 
