@@ -29,9 +29,10 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
         FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
     """
     root = root.absolute()  # of '.', the name beside which the parts lie is not known
+    exists = f"The output folder {root} exists already; remove it or name another."
     if root.exists():
         sweep(root)
-        raise TakenError(f"The output folder {root} exists already; remove it or name another.")
+        raise TakenError(exists)
     partial = _partial(root)
     mark = partial / MARK
     if partial.exists() and not mark.exists() and any(partial.iterdir()):
@@ -39,6 +40,8 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
     with locked(mark, taken=f"Another process is writing {root} at this moment."):
         folder = partial / "dataset"
         try:
+            if root.exists():  # by now
+                raise TakenError(exists)
             _clear(partial, keep)
             yield folder
             folder.rename(root)

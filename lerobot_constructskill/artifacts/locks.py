@@ -1,9 +1,11 @@
 """One process at a time, here or on a machine that shares the file system. Standard library only."""
 
 import fcntl
+import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 from lerobot_constructskill.errors import TakenError
 
@@ -18,10 +20,23 @@ def locked(path: Path, taken: str | None = None) -> Iterator[None]:
     Raises:
         TakenError: another process holds it.
     """
+    lock = None
+    while lock is None:
+        lock = _lock(path, taken)
+    with lock:
+        yield
+
+
+def _lock(path: Path, taken: str | None) -> TextIO | None:
+    """The file, open and locked; None where the process that held it has removed it meanwhile."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as lock:
+    with suppress(FileNotFoundError), ExitStack() as stack:
+        lock = stack.enter_context(path.open("a"))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | (fcntl.LOCK_NB if taken else 0))
         except BlockingIOError:
             raise TakenError(taken) from None
-        yield
+        if os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+            stack.pop_all()
+            return lock
+    return None
