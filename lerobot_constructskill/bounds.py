@@ -165,6 +165,8 @@ def _complaint(value: Any, kind: Any) -> str | None:
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Annotated:
         base, *rules = inner
+        if get_origin(base) is list and _is_list(value) and (complaint := _complaint(value, base)):
+            return complaint  # of an item, which the rules of the list say nothing about
         wrong = [rule for rule in rules if _complaint(value, base) or not rule.allows(value)]
         return wrong[0].wanted(_NAMES.get(base, "a value")) if wrong else None
     if origin in (Union, UnionType):

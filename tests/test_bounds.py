@@ -47,7 +47,7 @@ class Config:
         ("count", 10**9, "not 1000000000."),
         ("count", 2.0, "a whole number"),
         ("seeds", [], r"a list of at least one, not \[\]"),
-        ("seeds", [0, -1], "not"),
+        ("seeds", [0, -1], r"a list, each a whole number from 0 to \d+, not \[0, -1\]"),
         ("seeds", "12", "not '12'."),
         ("matrix", [[1.0], [math.nan]], "noise.matrix must be a list, each a list, each a finite number"),
         ("model", "white", "noise.model must be one of fixed, dart, not 'white'."),

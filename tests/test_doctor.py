@@ -79,10 +79,13 @@ def test_complaints_name_their_cause() -> None:
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb\t", "")).message
 
 
-@pytest.mark.parametrize(("level", "status"), [(Level.OK, 0), (Level.WARN, 0), (Level.FAIL, 1)])
-def test_exit_status(level: Level, status: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert diagnose([lambda: Finding(level, "Thing", "a message.")]) == status
-    assert capsys.readouterr().out.startswith(f"{level}")
+@pytest.mark.parametrize(
+    ("levels", "status"),
+    [([Level.OK], 0), ([Level.OK, Level.WARN], 0), ([Level.OK, Level.FAIL], 1), ([Level.WARN], 1)],
+)
+def test_exit_status(levels: list[Level], status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert diagnose([lambda level=level: Finding(level, "Thing", "a message.") for level in levels]) == status
+    assert capsys.readouterr().out.startswith(f"{levels[0]}")
 
 
 def test_probe_survives_what_it_runs() -> None:

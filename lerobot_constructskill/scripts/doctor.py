@@ -169,7 +169,7 @@ def fetching() -> list[Callable[[], Finding]]:
 
 
 def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
-    """Run the checks, print each finding as it comes, and return the exit status: 1 where one failed."""
+    """Run the checks, print each finding as it comes, and return the exit status: 1 if one failed or none passed."""
     levels = []
     for check in checks:
         finding = check()
@@ -177,14 +177,14 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
         print(f"{finding.level:<4}  {finding.name:<17}  {finding.message}", flush=True)
     failed, warned = levels.count(Level.FAIL), levels.count(Level.WARN)
     print(f"{plural(len(levels), 'check')}, {failed} failed, {warned} warned.")
-    return int(failed > 0)
+    return int(failed > 0 or Level.OK not in levels)
 
 
 def main() -> None:
     parser = Parser(
         prog="constructskill-doctor",
         description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin, the pretrained weights "
-        "and the encoder's speed on this machine (about a minute). Exit status 1 where something fails.",
+        "and the encoder's speed on this machine (about a minute). Exit status 1 if one fails or none passes.",
         epilog=EPILOG,
     )
     parser.add_argument(
