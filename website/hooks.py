@@ -1,7 +1,7 @@
 """MkDocs' hook: which files the site has. They stand as they do in the repository, so links need no second form.
 
 The site holds the chapters (README.md, CHANGELOG.md, docs/, the reports of results/), all that they link to, and pages
-that are made of the code: of each task, of the commands and of the Python interface.
+that are made of the code: of each task, of the commands, of the Python interface and of the leaderboard's entries.
 """
 
 import os
@@ -9,6 +9,7 @@ import re
 from fnmatch import fnmatch
 from pathlib import Path
 
+import board_pages
 import reference
 import task_pages
 from mkdocs.config.defaults import MkDocsConfig
@@ -35,7 +36,7 @@ LANGUAGES = {".py": "python", ".yaml": "text", "": "dockerfile"}
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Put the repository's files in place of those of docs/."""
     linked = reached(CHAPTERS)
-    made = {**task_pages.pages(ROOT), **reference.pages(ROOT)}
+    made = {**task_pages.pages(ROOT), **reference.pages(ROOT), **board_pages.files(ROOT)}
     made |= {shown(path): source_page(path) for path in linked if is_source(path)}
     theirs = [file for file in files if file.src_dir != config.docs_dir and not UNUSED.search(file.src_uri)]
     twins = config.extra["copies"] = copies(linked)
