@@ -293,12 +293,12 @@ class PickPlaceEnv(BaseEnv):
         rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")
         if not amount:
             return rest
-        arms = len(rest) - 2
+        joints = len(rest) - 2
         if self._has_own_seed:
             seeds = [[int(self._episode_seed[i]), self.draws.perturbation.seed] for i in env_idx.cpu()]
-            noise = np.array([np.random.default_rng(seed).standard_normal(arms) for seed in seeds])
+            noise = np.array([np.random.default_rng(seed).standard_normal(joints) for seed in seeds])
         else:
-            noise = np.reshape(self._batched_episode_rng[env_idx].standard_normal(size=arms), (-1, arms))
+            noise = np.reshape(self._batched_episode_rng[env_idx].standard_normal(size=joints), (-1, joints))
         return rest + amount * np.pad(noise, ((0, 0), (0, 2)))
 
     def _spawn_offsets(self, rng: BatchedRNG) -> np.ndarray:
