@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/run.py [name ...]
 
-The names are rendering, resets, encoders, training, keypoints, waiting, evaluation, drift, merging and scaling; all by
-default. Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the
-fast set are made on the first run, in outputs/bench ($BENCH_OUT).
+The names are rendering, resets, encoders, training, keypoints, side_by_side, waiting, evaluation, drift, merging and
+scaling; all by default. Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and
+features of the fast set are made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
@@ -28,6 +28,7 @@ NAMES = (
     "encoders",
     "training",
     "keypoints",
+    "side_by_side",
     "waiting",
     "evaluation",
     "drift",

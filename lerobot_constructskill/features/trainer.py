@@ -1,28 +1,39 @@
 """How a study trains frozen_vit: demonstrations through the encoder once, then the heads on what came out."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, contextmanager
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import finished_sha256, versions
+from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import InputError, MissingWeightsError
 from lerobot_constructskill.features.encode import PARTS, join_feature_sets, load_encoder, write_feature_set
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import close_patches, describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import (
+    heldout_mse,
+    save_checkpoint,
+    train_seeds,
+    with_heads,
+)
 from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
+from lerobot_constructskill.progress import Progress, quiet
 
 
 class FeatureTrainer:
@@ -32,8 +43,7 @@ class FeatureTrainer:
     packages = ("torchcodec", "transformers", "timm", "openvino")
 
     def seeds_together(self, config: FrozenViTChunkConfig) -> bool:
-        """Where the readout learns, each step reads tens of megabytes a seed: stacking only costs memory."""
-        return not READOUTS[config.readout].learns
+        return True
 
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
         """Write out what `auto` means here, and which weights there are; None where there are none.
@@ -88,14 +98,13 @@ class FeatureTrainer:
         held_out: Sequence[int],
         store: Store,
     ) -> None:
-        """Train every seed of `writers` and write its checkpoint where its writer says."""
+        """Train every seed of `writers` and write its checkpoint where its writer says, as soon as it is trained."""
         features = obtain_features(config, demonstrations, store)
-        policies = train_seeds(config, features, list(writers), epochs, batch_size, held_out)
-        preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
-        errors = heldout_mse(policies, features, held_out, preprocess)
-        for policy, error, write in zip(policies, errors, writers.values(), strict=True):
+        for seed, policy in _trained(config, features, list(writers), epochs, batch_size, held_out):
+            preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=features.meta.stats)
+            (error,) = heldout_mse([policy], features, held_out, preprocess)
             made_of = {config.backbone: _backbone_line(policy.config)}
-            with write(heldout_mse_m2=error, made_of=made_of) as folder:
+            with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
                 save_checkpoint(policy, features, folder)
 
     def heldout_mse(
@@ -126,6 +135,55 @@ class FeatureTrainer:
         on_device = {"device_processor": {"device": policy.config.device}}
         preprocess, _ = make_pre_post_processors(policy.config, str(checkpoint), preprocessor_overrides=on_device)
         return heldout_mse([policy], features, held_out, preprocess)[0]
+
+
+def _trained(
+    config: FrozenViTChunkConfig, features: LeRobotDataset, seeds: Sequence[int], *recipe: Any
+) -> Iterator[tuple[int, FrozenViTChunkPolicy]]:
+    """Yield every seed with its policy.
+
+    Seeds are stacked, but where the readout learns: each step then reads tens of megabytes a seed, and stacking only
+    costs memory. Such seeds are trained side by side, a process for each core, or one after another on a GPU.
+    """
+    if not READOUTS[config.readout].learns:
+        yield from zip(seeds, train_seeds(config, features, seeds, *recipe), strict=True)
+    elif min(len(seeds), cores()) == 1 or config.device != "cpu":
+        for seed in seeds:
+            yield seed, train_seeds(config, features, [seed], *recipe)[0]
+    else:
+        yield from _trained_side_by_side(config, features, seeds, recipe)
+
+
+def _trained_side_by_side(
+    config: FrozenViTChunkConfig, features: LeRobotDataset, seeds: Sequence[int], recipe: tuple
+) -> Iterator[tuple[int, FrozenViTChunkPolicy]]:
+    """One that fails does not keep the others."""
+    template, failed = make_policy(deepcopy(config), ds_meta=features.meta), None
+    with (
+        open_pool("processes", min(len(seeds), cores())) as submit,
+        Progress(total=len(seeds), desc="training", unit="seed") as bar,
+    ):
+        running = [submit(_train_heads, config, features.repo_id, features.root, seed, recipe) for seed in seeds]
+        for seed, future in zip(seeds, running, strict=True):
+            try:
+                heads = future.result()
+            except BrokenExecutor:
+                raise
+            except Exception as error:
+                failed = error
+                continue
+            bar.update()
+            yield seed, with_heads(template, heads)
+    if failed is not None:
+        raise failed
+
+
+def _train_heads(config: FrozenViTChunkConfig, repo_id: str, root: Path, seed: int, recipe: tuple) -> ChunkHeads:
+    """In a process of its own, in which denormal numbers are zero, as in that of its study."""
+    torch.set_flush_denormal(True)
+    with quiet():
+        (policy,) = train_seeds(config, LeRobotDataset(repo_id, root=root), [seed], *recipe)
+    return policy.heads
 
 
 def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset, store: Store) -> LeRobotDataset:

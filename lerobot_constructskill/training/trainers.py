@@ -67,7 +67,7 @@ class Trainer:
     compute now. Without it, none is validated on others."""
 
     def seeds_together(self, config: PreTrainedConfig) -> bool:
-        """Whether `fit` should get many seeds at once: they are then kept, or fail, together."""
+        """Whether `fit` should get many seeds at once. Where it raises, those failed that it has not written."""
         return False
 
     def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:

@@ -1,11 +1,14 @@
 """Seeds trained together are the seeds trained alone, and end as LeRobot checkpoints."""
 
-from functools import cache
+from concurrent.futures import Future
+from contextlib import contextmanager
+from functools import cache, partial
 
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from safetensors.torch import load_file
 
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.features import trainer
@@ -71,10 +74,63 @@ def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
     assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
 
 
-@pytest.mark.parametrize("name", READOUTS)
-def test_a_study_trains_together_what_learns_nothing_from_patches(name, config):
-    """The others take minutes each: a study that is killed in the second has the first."""
-    assert FeatureTrainer().seeds_together(config(readout=name)) != READOUTS[name].learns
+@pytest.mark.parametrize("readout", ["cls", "spatial_softmax"])
+def test_weights_do_not_depend_on_the_number_of_cores(readout, config, feature_set):
+    trained = []
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        (policy,) = train_seeds(config(readout=readout, head_hidden_dim=256), feature_set, [0], **TRAINING)
+        trained.append(policy.heads.state_dict())
+        assert torch.get_num_threads() == threads
+    assert all(torch.equal(trained[0][name], trained[1][name]) for name in trained[0])
+
+
+def fit(config, feature_set, seeds, folder, monkeypatch):
+    """What a study has its trainer do, on features that are there: the weights of every seed, as they were written."""
+    monkeypatch.setattr(trainer, "obtain_features", lambda *_: feature_set)
+    written = {}
+
+    @contextmanager
+    def write(seed, **facts):
+        yield folder / str(seed)
+        written[seed] = load_file(folder / str(seed) / "model.safetensors"), facts["heldout_mse_m2"]
+
+    writers = {seed: partial(write, seed) for seed in seeds}
+    FeatureTrainer().fit(config, feature_set, writers, EPOCHS, BATCH_SIZE, HELD_OUT, Store(folder / "store"))
+    return written
+
+
+@pytest.mark.slow
+def test_seeds_side_by_side_are_the_seeds_one_after_another(config, feature_set, tmp_path, monkeypatch):
+    learns = config(readout="spatial_softmax", save_backbone=False)
+    monkeypatch.setattr(trainer, "cores", lambda: 2)
+    beside = fit(learns, feature_set, [3, 0], tmp_path / "beside", monkeypatch)
+    monkeypatch.setattr(trainer, "cores", lambda: 1)
+    after = fit(learns, feature_set, [3, 0], tmp_path / "after", monkeypatch)
+    assert list(beside) == list(after) == [3, 0]
+    for seed, (weights, error) in beside.items():
+        assert error == after[seed][1] and all(torch.equal(weights[name], after[seed][0][name]) for name in weights)
+
+
+def test_a_seed_that_fails_does_not_keep_those_beside_it(config, feature_set, tmp_path, monkeypatch):
+    """The pool stands in for processes, in which nothing can be replaced."""
+
+    @contextmanager
+    def pool(executor, workers):
+        def submit(function, config, repo_id, root, seed, recipe):
+            future = Future()
+            future.set_exception(ValueError("of seed 3")) if seed == 3 else future.set_result(
+                function(config, repo_id, root, seed, recipe)
+            )
+            return future
+
+        yield submit
+
+    monkeypatch.setattr(trainer, "open_pool", pool)
+    monkeypatch.setattr(trainer, "cores", lambda: 2)
+    with pytest.raises(ValueError, match="of seed 3"):
+        fit(config(readout="attention", save_backbone=False), feature_set, [3, 0], tmp_path, monkeypatch)
+    assert (tmp_path / "0" / "model.safetensors").is_file() and not (tmp_path / "3").exists()
 
 
 def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monkeypatch):

@@ -1,10 +1,12 @@
 """Many training seeds in one pass over a feature set, each of which ends as an ordinary LeRobot checkpoint.
 
 The heads of every seed are stacked and stepped together. AdamW works element by element, gradients are clipped per
-seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding.
+seed and no seed sees another, so a seed trained among others is the seed trained alone, up to rounding. One thread
+trains: sums over several depend on their number, and so would the weights on how many cores a machine has.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import copy, deepcopy
 from pathlib import Path
 
@@ -57,8 +59,9 @@ def train_seeds(
     rows = torch.nonzero(~_is_among(dataset, held_out)).squeeze(1)
     heads = [_fresh_heads(template, seed) for seed in seeds]
     orders = [_Order(rows, seed, epochs, batch_size) for seed in seeds]
-    _step_together(heads, template.config, inputs, table, orders)
-    return [_with_heads(template, its_heads) for its_heads in heads]
+    with one_thread():
+        _step_together(heads, template.config, inputs, table, orders)
+    return [with_heads(template, its_heads) for its_heads in heads]
 
 
 def heldout_mse(
@@ -88,6 +91,17 @@ def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folde
     policy.save_pretrained(folder)
     for processor in make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats):
         processor.save_pretrained(folder)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Have torch compute in this thread alone for as long as the block takes."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class _Order:
@@ -238,7 +252,7 @@ def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
         gradient.mul_(scale.view(-1, *[1] * (gradient.ndim - 1)))
 
 
-def _with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
+def with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
     """A copy of a policy with other heads and the same backbone."""
     policy = deepcopy(template, {id(template.backbone): template.backbone})
     policy.heads = heads
