@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.demos.precise import yaw_of
 
 TURNED = np.radians(3)
 
@@ -20,8 +21,7 @@ def main(folders: list[str]) -> None:
         data = open_dataset(Path(folder))
         if "dagger" not in data.facts:
             continue
-        w, x, y, z = data.column("sim.object_pose")[data.rounds > 0, 3:].T
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        yaw = yaw_of(data.column("sim.object_pose")[data.rounds > 0])
         key = data.config.task, len(data.facts["dagger"]["rounds"])
         frames[key] += len(yaw)
         turned[key] += int((np.abs(np.sin(yaw)) > np.sin(TURNED)).sum())

@@ -12,7 +12,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import AXES, Perturbation
 
 FIRST_START = 5000
-"""Seed of the first evaluation start. Nothing was trained on any; docs/leaderboard.md says what was chosen on them."""
+"""Seed of the first evaluation start. None of them was trained on; docs/leaderboard.md says what was chosen there."""
 
 EPISODES = 50
 """Starts of every setting whose initial state is drawn."""

@@ -42,13 +42,8 @@ class Plan:
             raise InputError(
                 f"The base '{self.config.base}' has executed actions as labels; DAgger needs the expert's."
             )
-        self._check_starts(base)
+        check_apart({"demonstrations": base.starts, "rounds": self.config.starts, "evaluation": self.eval_seeds})
         return base
-
-    def _check_starts(self, base: GenerateConfig) -> None:
-        """Refuse a start that two of demonstrations, rounds and evaluation would have."""
-        rounds = range(self.seeds(1).start, self.seeds(self.config.rounds).stop)
-        check_apart({"demonstrations": base.starts, "rounds": rounds, "evaluation": self.eval_seeds})
 
     @cached_property
     def policy(self) -> PreTrainedConfig:
@@ -123,8 +118,8 @@ class Plan:
 
     def seeds(self, number: int) -> range:
         """Those of a round."""
-        first = self.config.seed_start + (number - 1) * self.config.episodes
-        return range(first, first + self.config.episodes)
+        first = (number - 1) * self.config.episodes
+        return self.config.starts[first : first + self.config.episodes]
 
     @property
     def eval_seeds(self) -> range:

@@ -67,6 +67,11 @@ class DaggerConfig:
         if "type" not in self.policy:
             raise InputError("policy must name its type, such as 'type: frozen_vit'.")
 
+    @property
+    def starts(self) -> range:
+        """Seeds of the episodes of all rounds."""
+        return range(self.seed_start, self.seed_start + self.rounds * self.episodes)
+
     def beta(self, number: int) -> float:
         """That of a round, counted from 1."""
         return self.betas[min(number, len(self.betas)) - 1]

@@ -98,7 +98,7 @@ def pictures(data: DataSet, camera: str) -> Iterator[tuple[int, np.ndarray]]:
     """Yield the row and the (H, W, 3) uint8 picture of every frame, in the order of the rows.
 
     Raises:
-        ValueError: a video that cannot be decoded.
+        ValueError: a video that cannot be decoded, or more or fewer frames than rows.
     """
     import av
 

@@ -143,8 +143,7 @@ class TurningExpert(PreciseExpert):
         return np.array([*translation, turn, gripper])
 
     def _yaw_error(self, state: PrivilegedState, progress: Progress) -> float:
-        w, x, y, z = state.object_pose[3:]
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        yaw = yaw_of(state.object_pose)
         match progress.phase:
             case Phase.PREGRASP | Phase.DESCEND:
                 jaws = np.arctan2(-state.jaw_axis[0], state.jaw_axis[1])
@@ -167,6 +166,12 @@ class TurningExpert(PreciseExpert):
     def _is_at_receptacle(self, stance: Stance) -> bool:
         is_turned = abs(self._yaw_error(stance.state, self._beginning(Phase.CARRY, stance.state))) < YAW_STEP
         return super()._is_at_receptacle(stance) and (is_turned or stance.underside < stance.rim)
+
+
+def yaw_of(pose: np.ndarray) -> np.ndarray:
+    """Turn of poses (..., 7) about the vertical, in radians from -pi to pi."""
+    w, x, y, z = np.moveaxis(pose[..., 3:], -1, 0)
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def _half_turn(angle: float) -> float:

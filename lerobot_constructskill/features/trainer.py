@@ -100,12 +100,13 @@ class FeatureTrainer:
     ) -> None:
         """Train every seed of `writers` and write its checkpoint where its writer says, as soon as it is trained."""
         features = obtain_features(config, demonstrations, store)
-        for seed, policy in _trained(config, features, list(writers), epochs, batch_size, held_out):
-            preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=features.meta.stats)
-            (error,) = heldout_mse([policy], features, held_out, preprocess)
-            made_of = {config.backbone: _backbone_line(policy.config)}
-            with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
-                save_checkpoint(policy, features, folder)
+        for seeds, policies in _trained(config, features, list(writers), epochs, batch_size, held_out):
+            preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
+            errors = heldout_mse(policies, features, held_out, preprocess)
+            for seed, policy, error in zip(seeds, policies, errors, strict=True):
+                made_of = {config.backbone: _backbone_line(policy.config)}
+                with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
+                    save_checkpoint(policy, features, folder)
 
     def heldout_mse(
         self,
@@ -139,24 +140,24 @@ class FeatureTrainer:
 
 def _trained(
     config: FrozenViTChunkConfig, features: LeRobotDataset, seeds: Sequence[int], *recipe: Any
-) -> Iterator[tuple[int, FrozenViTChunkPolicy]]:
-    """Yield every seed with its policy.
+) -> Iterator[tuple[Sequence[int], list[FrozenViTChunkPolicy]]]:
+    """Yield seeds with their policies, as many at once as are finished at once.
 
     Seeds are stacked, but where the readout learns: each step then reads tens of megabytes a seed, and stacking only
     costs memory. Such seeds are trained side by side, a process for each core, or one after another on a GPU.
     """
     if not READOUTS[config.readout].learns:
-        yield from zip(seeds, train_seeds(config, features, seeds, *recipe), strict=True)
+        yield seeds, train_seeds(config, features, seeds, *recipe)
     elif min(len(seeds), cores()) == 1 or config.device != "cpu":
         for seed in seeds:
-            yield seed, train_seeds(config, features, [seed], *recipe)[0]
+            yield [seed], train_seeds(config, features, [seed], *recipe)
     else:
         yield from _trained_side_by_side(config, features, seeds, recipe)
 
 
 def _trained_side_by_side(
     config: FrozenViTChunkConfig, features: LeRobotDataset, seeds: Sequence[int], recipe: tuple
-) -> Iterator[tuple[int, FrozenViTChunkPolicy]]:
+) -> Iterator[tuple[Sequence[int], list[FrozenViTChunkPolicy]]]:
     """One that fails does not keep the others."""
     template, failed = make_policy(deepcopy(config), ds_meta=features.meta), None
     with (
@@ -173,7 +174,7 @@ def _trained_side_by_side(
                 failed = error
                 continue
             bar.update()
-            yield seed, with_heads(template, heads)
+            yield [seed], [with_heads(template, heads)]
     if failed is not None:
         raise failed
 

@@ -210,10 +210,10 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
     learnt = {"demonstrations": data, "policy": policy, "training": training}
     if variant.dagger:
         rounds = _dagger_config(variant)
-        if (starts := rounds.rounds * rounds.episodes) > SEEDS_APART and study.demonstrations != SHARED:
+        if len(rounds.starts) > SEEDS_APART and study.demonstrations != SHARED:
             raise InputError(
                 f"variants.{name}.dagger: where each training seed has demonstrations of its own, all rounds together "
-                f"may have {SEEDS_APART:,} episodes at most, not {starts:,}."
+                f"may have {SEEDS_APART:,} episodes at most, not {len(rounds.starts):,}."
             )
         base = f"{data.name} --seed_start={data.config.seed_start}" if data.moved else data.name
         start = rounds.seed_start + data.moved
@@ -222,7 +222,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations
         first = study.eval_seed
         starts = {"demonstrations": data.config.starts, "evaluation": range(first, first + study.episodes)}
         if variant.dagger:
-            starts["rounds"] = range(start, start + rounds.rounds * rounds.episodes)
+            starts["rounds"] = learnt["dagger"].starts
         check_apart(starts)
     elsewhere = (_variant_arm(study, name, replace(variant, policy=other), data, common) for other in others)
     return Arm(name=name, role=VARIANT, elsewhere=tuple(elsewhere), **learnt, **common)

@@ -74,14 +74,22 @@ def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
     assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
 
 
+@pytest.fixture
+def threads():
+    """Put the number of torch's threads back."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("readout", ["cls", "spatial_softmax"])
-def test_weights_do_not_depend_on_the_number_of_cores(readout, config, feature_set):
+def test_weights_do_not_depend_on_the_number_of_cores(readout, config, feature_set, threads):
     trained = []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
+    for number in (1, 2):
+        torch.set_num_threads(number)
         (policy,) = train_seeds(config(readout=readout, head_hidden_dim=256), feature_set, [0], **TRAINING)
         trained.append(policy.heads.state_dict())
-        assert torch.get_num_threads() == threads
+        assert torch.get_num_threads() == number
     assert all(torch.equal(trained[0][name], trained[1][name]) for name in trained[0])
 
 
