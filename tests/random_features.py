@@ -12,6 +12,7 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe
+from lerobot_constructskill.policies.frozen_vit.readouts import POINTS
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 
 TINY = "vit_tiny16"
@@ -40,7 +41,7 @@ def other_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> L
 
 
 def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDataset:
-    """Eight episodes whose actions are a linear function of random features, and random patch features beside them."""
+    """Eight episodes whose actions are a linear function of random features, with random points and patch features."""
     spec = BACKBONES[TINY]
     encoder = FrozenEncoder(spec)
     encoder.model.load_state_dict(load_file(tiny_weights))
@@ -49,6 +50,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
     column = {"dtype": "float32", "shape": (dim,), "names": None, "info": info}
     features = {
         "observation.features.base": column,
+        "observation.points.base": {"dtype": "float32", "shape": (2 * len(POINTS),), "names": None},
         "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{i}" for i in range(8)]},
         "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
     }
@@ -63,6 +65,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
             dataset.add_frame(
                 {
                     "observation.features.base": feature.astype(np.float32),
+                    "observation.points.base": rng.uniform(-1, 1, 2 * len(POINTS)).astype(np.float32),
                     "observation.state": rng.normal(size=8).astype(np.float32),
                     "action": action.astype(np.float32),
                     "task": "a task",

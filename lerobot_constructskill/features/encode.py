@@ -15,10 +15,11 @@ from lerobot_constructskill.artifacts.digests import data_sha256, digest
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key, point_key
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.progress import Progress, quiet
@@ -65,6 +66,7 @@ def write_feature_set(
     folder: Path,
     batch_size: int = 16,
     patches: bool = False,
+    points: bool = False,
 ) -> None:
     """Write a copy of `dataset` with the pooled features of one camera, (N, D) float32, in place of its images.
 
@@ -75,16 +77,18 @@ def write_feature_set(
         encoder: what encodes, and with `info` its description, as `load_encoder` returns them.
         folder: where to, a path that `staged` gave; episodes that a killed run finished are not encoded again.
         patches: whether to write every patch's feature as well, to `PATCHES_FILE`.
+        points: whether to write as well where in the image the points of `readouts.POINTS` are.
 
     Raises:
-        ValueError: the data set has no such camera.
+        ValueError: the data set has no such camera, or does not say where things are.
     """
     info = _with_source(info, dataset)
     made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
+    found = _find_points(dataset, camera, encoder.crop) if points else {}
     with room_for(folder):
         features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
-        _write_copy(dataset, camera, features, info, repo_id, folder)
+        _write_copy(dataset, camera, features, info, repo_id, folder, found)
         if patches:
             of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
             _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
@@ -98,6 +102,7 @@ def join_feature_sets(
     repo_id: str,
     folder: Path,
     patches: bool = False,
+    points: bool = False,
 ) -> None:
     """Write what `write_feature_set` would, from the feature sets of the parts that `dataset` was merged of, in order.
 
@@ -105,13 +110,25 @@ def join_feature_sets(
         ValueError: the parts have other numbers of frames.
     """
     key = feature_key(camera)
-    pooled = [np.stack(part.hf_dataset.with_format("numpy")[key][:]) for part in parts]
+    pooled = [_column(part, key) for part in parts]
+    name = point_key(camera)
+    found = {name: np.concatenate([_column(part, name) for part in parts])} if points else {}
     if sum(map(len, pooled)) != dataset.num_frames:
         raise InputError(f"The parts of '{dataset.repo_id}' do not add up to its {dataset.num_frames} frames.")
     with room_for(folder):
-        _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder)
+        _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder, found)
         if patches:
             _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
+
+
+def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
+    return np.stack(dataset.hf_dataset.with_format("numpy")[name][:])
+
+
+def _find_points(dataset: LeRobotDataset, camera: str, crop: Crop | None) -> dict[str, np.ndarray]:
+    """The column of points, by its name."""
+    known = {name: _column(dataset, name) for name in POSES.values() if name in dataset.meta.features}
+    return {point_key(camera): find_points(known, camera, crop)}
 
 
 def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
@@ -176,13 +193,22 @@ def _save(file: Path, array: np.ndarray) -> None:
 
 
 def _write_copy(
-    dataset: LeRobotDataset, camera: str, features: np.ndarray, info: dict[str, str], repo_id: str, folder: Path
+    dataset: LeRobotDataset,
+    camera: str,
+    features: np.ndarray,
+    info: dict[str, str],
+    repo_id: str,
+    folder: Path,
+    points: dict[str, np.ndarray],
 ) -> None:
     key = feature_key(camera)
-    column = {"dtype": "float32", "shape": (features.shape[1],), "names": None, "info": info}
+    made = {key: features, **points}
+    columns = {name: {"dtype": "float32", "shape": (of.shape[1],), "names": None} for name, of in made.items()}
+    columns[key]["info"] = info
     with quiet():
-        copy = modify_features(dataset, {key: (features, column)}, _left_out(dataset), folder, repo_id)
-    stats = compute_episode_stats({key: features}, {key: column})
+        added = {name: (of, columns[name]) for name, of in made.items()}
+        copy = modify_features(dataset, added, _left_out(dataset), folder, repo_id)
+    stats = compute_episode_stats(made, columns)
     write_stats({**(copy.meta.stats or {}), **stats}, folder)
     _forget_videos(folder)
 

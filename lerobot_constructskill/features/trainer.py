@@ -58,6 +58,9 @@ class FeatureTrainer:
         sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
 
+    def idle(self, config: FrozenViTChunkConfig) -> tuple[str, ...]:
+        return () if READOUTS[config.readout].points else ("point_weight",)
+
     def settled_elsewhere(self, config: FrozenViTChunkConfig) -> list[dict[str, Any]]:
         """The precisions that `auto` means on other machines."""
         here = resolve_precision(config.backbone_precision, config.device)
@@ -79,7 +82,7 @@ class FeatureTrainer:
                 info = of_parts[0].meta.features[feature_key(config.camera)]["info"]
                 joined = of_parts, info, f"local/{made.digest}"
                 with store.writing(made) as folder:
-                    join_feature_sets(whole, config.camera, *joined, folder, made.spec["patches"])
+                    join_feature_sets(whole, config.camera, *joined, folder, **_beside(config))
         try:
             yield
         finally:
@@ -190,32 +193,38 @@ def _train_heads(config: FrozenViTChunkConfig, repo_id: str, root: Path, seed: i
 def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset, store: Store) -> LeRobotDataset:
     """Return the features of demonstrations under a policy's encoder, from a store, where they are made if need be.
 
-    Patch features, 0.2 MB a frame, are there where the policy's readout looks at them.
+    Patch features, 0.2 MB a frame, are there where the policy's readout looks at them, and points where it finds some.
 
     Raises:
         FileNotFoundError: no source has the encoder's weights.
     """
     made = features_artifact(config, demonstrations)
-    repo_id, patches = f"local/{made.digest}", made.spec["patches"]
+    repo_id = f"local/{made.digest}"
     with store.claim([made]) as missing:
         if missing:
             eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
             encoder, info = load_encoder(config.backbone, config.backbone_path, _precision(config), *eyes)
             with store.writing(made, keep=PARTS) as folder:
-                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, patches=patches)
+                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, **_beside(config))
     return LeRobotDataset(repo_id, root=store.folder(made))
 
 
 def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset) -> Artifact:
     """What `obtain_features` returns. Raises as it does."""
-    spec, patches = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].reads_patches
+    spec = get_backbone(config.backbone, config.backbone_path)
     if config.backbone_sha256 is None:
         load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
-    return Artifact("features", {**source, "patches": patches, "encoder": made_by, "versions": made_in})
+    return Artifact("features", {**source, **_beside(config), "encoder": made_by, "versions": made_in})
+
+
+def _beside(config: FrozenViTChunkConfig) -> dict[str, bool]:
+    """What a feature set needs beside the pooled features, for the policy's readout to learn."""
+    readout = READOUTS[config.readout]
+    return {"patches": readout.reads_patches} | ({"points": True} if readout.points else {})
 
 
 def _precision(config: FrozenViTChunkConfig) -> str:

@@ -28,6 +28,7 @@ class EncodeConfig:
     camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
+    points: bool = False  # also write where in the image object, receptacle and hand are, for the readout heat_maps
     batch_size: BatchSize = 16  # images at a time
     device: Device | None = None  # default: a GPU if there is one
 
@@ -66,7 +67,15 @@ def encode(config: EncodeConfig) -> Path:
         )
         dataset = open_lerobot(config.repo_id, config.root, config.revision)
         write_feature_set(
-            dataset, config.camera, encoder, info, out_repo_id, folder, config.batch_size, config.patches
+            dataset,
+            config.camera,
+            encoder,
+            info,
+            out_repo_id,
+            folder,
+            config.batch_size,
+            config.patches,
+            config.points,
         )
     return out_root
 

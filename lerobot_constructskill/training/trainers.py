@@ -74,6 +74,10 @@ class Trainer:
         """Return the configuration with everything written out that it leaves to the machine."""
         return config
 
+    def idle(self, config: PreTrainedConfig) -> tuple[str, ...]:
+        """Fields that a policy of this configuration has no use for, so that they do not show in its checkpoint."""
+        return ()
+
     def settled_elsewhere(self, config: PreTrainedConfig) -> list[dict[str, Any]]:
         """The fields that machines of another kind would write out otherwise: one dictionary for each kind."""
         return []
@@ -126,7 +130,8 @@ def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
     it holds, unless `pretrained_revision` says which commit.
     """
     fields = draccus.encode(config)
-    for name in (*ELSEWHERE, *trainer_of(config).places):
+    trainer = trainer_of(config)
+    for name in (*ELSEWHERE, *trainer.places, *trainer.idle(config)):
         fields.pop(name, None)
     if config.pretrained_path and (weights := Path(config.pretrained_path) / "model.safetensors").is_file():
         fields["pretrained_path"] = f"sha256 {file_sha256(weights)}"

@@ -35,7 +35,7 @@ def settings(tmp_path_factory, tiny_weights):
     policy = {"type": "frozen_vit", "backbone": "vit_tiny16", "backbone_path": str(tiny_weights)}
     fields = {
         "base": "smoke",
-        "policy": policy | {"readout": "spatial_softmax"},
+        "policy": policy | {"readout": "heat_maps"},
         "training": {"epochs": 1, "batch_size": 64, "holdout": 2},
         "rounds": ROUNDS,
         "episodes": EPISODES,
@@ -85,7 +85,7 @@ def test_lerobot_reads_the_set_and_the_checkpoint(made):
     dataset = LeRobotDataset("local/driven", root=root / "dataset")
     frame = dataset[dataset.num_frames - 1]
     assert int(frame["dagger.round"]) == ROUNDS and frame["dagger.actor"] == "learner"
-    assert get_policy_class("frozen_vit").from_pretrained(root / "checkpoint").config.readout == "spatial_softmax"
+    assert get_policy_class("frozen_vit").from_pretrained(root / "checkpoint").config.readout == "heat_maps"
 
 
 @pytest.mark.parametrize("damage", ["rounds", "actor", "label"])

@@ -16,6 +16,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_constructskill.artifacts.folders import MARK
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -51,6 +52,7 @@ def source(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
             "phase": {"dtype": "string", "shape": (1,), "names": None},
             "sim.seed": {"dtype": "int64", "shape": (1,), "names": None},
+            **{name: {"dtype": "float32", "shape": (7,), "names": None} for name in POSES.values()},
         },
     )
     rng = np.random.default_rng(0)
@@ -65,6 +67,7 @@ def source(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
                     "action": np.array([*rng.uniform(-0.05, 0.05, 3), 1.0], dtype=np.float32),
                     "phase": "LIFT",
                     "sim.seed": np.array([1_000_000 + episode]),
+                    **{name: rng.normal(size=7).astype(np.float32) for name in POSES.values()},
                     "task": f"task {episode}",
                 }
             )
@@ -141,6 +144,16 @@ def test_patch_features_on_request(source, weights, tmp_path):
     assert patches.shape == (sum(LENGTHS), 196, 192) and patches.dtype == np.float16
     np.testing.assert_allclose(patches, expected, atol=1e-2)
     assert len(LeRobotDataset("local/out", root=tmp_path / "out")) == sum(LENGTHS)
+
+
+@pytest.mark.slow
+def test_points_on_request(source, weights, tmp_path):
+    crop = [0.25, 0.5, 0.75, 1.0]
+    encode(settings(source, weights, tmp_path / "out", points=True, crop=crop))
+    dataset = LeRobotDataset("local/out", root=tmp_path / "out")
+    columns = {name: np.stack([frame[name] for frame in source]) for name in POSES.values()}
+    written = torch.stack([frame["observation.points.base"] for frame in dataset])
+    np.testing.assert_array_equal(written, find_points(columns, "base", crop))
 
 
 def test_the_description_travels_with_the_data_set(source, encoded, weights):

@@ -33,7 +33,7 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"head_hidden_dim": 0}, "from 1 to .*, not 0"),
         ({"head_hidden_layers": 0}, "from 1 to 16, not 0"),
         ({"regression_loss": "huber"}, "mse, l1"),
-        ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention"),
+        ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention, heat_maps"),
         ({"readout": "mean", "standardize_features": True}, "readout=cls only, not mean"),
         ({"regression_weight": 0}, "above 0 .* not 0"),
         ({"scheduler_warmup_steps": -1}, "from 0 to .* not -1"),

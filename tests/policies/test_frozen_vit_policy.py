@@ -249,6 +249,32 @@ def test_a_keypoint_is_where_its_pattern_is(patch, position):
     torch.testing.assert_close(readout(patches), torch.tensor([position]))
 
 
+def test_heat_maps_learn_where_things_are_and_nothing_acts_on_where_they_are_said_to_be(make_policy, make_batch):
+    policy = make_policy(readout="heat_maps").train()
+    batch = make_batch(policy)
+    first = policy.forward(batch)[1]["point_loss"]
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=1e-2)
+    for _ in range(60):
+        optimizer.zero_grad()
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+    assert (last := policy.forward(batch)[1]["point_loss"]) < 0.7 * first, (first, last)
+    untold = {name: value for name, value in batch.items() if "points" not in name}
+    torch.testing.assert_close(policy.predict_action_chunk(untold), policy.predict_action_chunk(batch))
+    with pytest.raises(InputError, match="--patches=true --points=true"):
+        policy.forward(untold)
+
+
+def test_the_weight_of_the_points_is_the_configured_one(make_policy, make_batch):
+    losses = []
+    for weight in (1.0, 3.0):
+        policy = make_policy(readout="heat_maps", point_weight=weight)
+        losses.append([policy.forward(make_batch(policy), kind)[0] for kind in ("mean", "none")])
+        astray = policy.forward(make_batch(policy))[1]["point_loss"]
+    torch.testing.assert_close(losses[1][0] - losses[0][0], torch.tensor(2 * astray))
+    torch.testing.assert_close((losses[1][1] - losses[0][1]).mean(), torch.tensor(2 * astray))
+
+
 def test_a_state_that_is_not_shown_is_a_sentence(make_policy, images):
     policy = make_policy(use_state=True).eval()
     with pytest.raises(InputError, match="was trained with observation.state, which --env.obs_type=pixels_agent_pos"):

@@ -11,11 +11,13 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file
 
 from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features import trainer
 from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.training.trainers import policy_spec
 
 EPOCHS, BATCH_SIZE = 3, 16
 HELD_OUT = [3, 7]
@@ -72,6 +74,19 @@ def test_a_seed_among_others_is_the_seed_alone(fields, config, feature_set):
         torch.testing.assert_close(together[1].heads.state_dict()[name], parameter, atol=1e-6, rtol=1e-4)
     weights = [next(policy.heads.translation.parameters()) for policy in together]
     assert not torch.equal(weights[0], weights[1]) and not torch.equal(weights[1], weights[2])
+
+
+def test_heat_maps_are_not_trained_without_points(config, feature_set):
+    untold = LeRobotDataset(feature_set.repo_id, root=feature_set.root)
+    del untold.meta.info.features["observation.points.base"]
+    with pytest.raises(InputError, match="--points=true"):
+        train_seeds(config(readout="heat_maps"), untold, [0], **TRAINING)
+
+
+@pytest.mark.parametrize(("readout", "shows"), [("spatial_softmax", False), ("heat_maps", True)])
+def test_a_weight_that_nothing_is_weighed_by_makes_no_other_checkpoint(readout, shows, config):
+    one, other = (policy_spec(config(readout=readout, point_weight=weight)) for weight in (1.0, 2.0))
+    assert (one != other) == shows
 
 
 @pytest.fixture

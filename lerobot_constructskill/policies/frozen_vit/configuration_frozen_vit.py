@@ -13,7 +13,7 @@ from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSc
 
 from .backbone import IMAGE_SIZE
 from .backbones import check_backbone
-from .features import feature_key
+from .features import feature_key, point_key
 from .heads import REGRESSION_LOSSES
 from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
@@ -67,8 +67,9 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         blind: whether the encoder always sees a grey image, to measure what seeing gives.
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
-            ("spatial_softmax"), or what a few learned queries find ("attention"). On a feature set all but the
-            first need its patch features.
+            ("spatial_softmax"), what a few learned queries find ("attention"), or where the object, the receptacle and
+            the hand are ("heat_maps"). On a feature set all but the first need its patch features, and the last learns
+            from its points.
         standardize_features: whether each feature is standardised by the data set's mean and deviation. The linear
             heads can express the same functions either way (the paper's is False), but Adam needs far fewer
             samples. Needs a feature set, whose statistics go into the checkpoint; they are
@@ -94,6 +95,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         regression_weight: weight of the translations' loss (a squared error of about 1e-4 m2, an absolute one of
             about 3e-3 m) relative to the gripper's. It matters only with a readout that learns, because both heads
             then share its parameters.
+        point_weight: weight of the error of the points that the readout finds (half the image is 1) relative to the
+            gripper's loss; only with a readout that finds points.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
             None keeps it constant.
     """
@@ -140,6 +143,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
 
     regression_loss: Annotated[str, Among(tuple(REGRESSION_LOSSES))] = "mse"
     regression_weight: Weight = 1.0
+    point_weight: Weight = 1.0
     optimizer_lr: Rate = 1e-3
     optimizer_weight_decay: Decay = 1e-2
     scheduler_warmup_steps: Annotated[int, Range(0, 100_000_000, unit="steps")] | None = None
@@ -188,6 +192,15 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     @property
     def feature_key(self) -> str:
         return feature_key(self.camera)
+
+    @property
+    def point_key(self) -> str:
+        return point_key(self.camera)
+
+    @property
+    def losses(self) -> dict[str, str]:
+        """What errors cost, as `heads.chunk_errors` takes it."""
+        return {"gripper_head": self.gripper_head, "regression_loss": self.regression_loss}
 
     @property
     def feature_column(self) -> dict[str, Any] | None:

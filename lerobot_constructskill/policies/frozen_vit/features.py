@@ -15,6 +15,8 @@ from .precision import PRECISIONS
 
 FEATURE_PREFIX = "observation.features."
 
+POINT_PREFIX = "observation.points."
+
 PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
 
@@ -25,6 +27,11 @@ DESCRIBED = ("backbone", "weights_sha256", "precision", "readout", "preprocessin
 def feature_key(camera: str) -> str:
     """Column that holds the encoded frames of `camera`, (D,) float32."""
     return FEATURE_PREFIX + camera
+
+
+def point_key(camera: str) -> str:
+    """Column that says where in the frames of `camera` the readout's points are, (2P,) float32 from -1 to 1."""
+    return POINT_PREFIX + camera
 
 
 def open_patches(root: Path) -> Tensor:

@@ -7,6 +7,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from .readouts import POINT_SCALE
+
 REGRESSION_LOSSES = {"mse": Tensor.square, "l1": Tensor.abs}
 """What a translation's error costs: the paper's squared error, or the absolute one of ACT (Zhao et al. 2023)."""
 
@@ -42,13 +44,17 @@ class ChunkHeads(nn.Module):
         self.translation = _head(input_dim, hidden, chunk_size * n_regressed)
         self.gripper = _head(input_dim, hidden, chunk_size)
 
-    def forward(self, pooled: Tensor, state: Tensor | None = None) -> Tensor:
-        """Return (B, T, A) for pooled tokens (B, ...): bounded translations, then the gripper's logit or number."""
-        inputs = self.readout(pooled)
-        if state is not None:
-            inputs = torch.cat([inputs, state], dim=-1)
+    def forward(self, pooled: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return a chunk and what the readout made, for pooled tokens (B, ...).
+
+        Returns:
+            (B, T, A), bounded translations, then the gripper's logit or number; and the readout's vector.
+        """
+        read = self.readout(pooled)
+        inputs = read if state is None else torch.cat([read, state], dim=-1)
         regressed = self.translation(inputs).unflatten(-1, self.chunk_shape)
-        return torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
+        chunk = torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
+        return chunk, read
 
 
 def _head(input_dim: int, hidden: list[int], output_dim: int) -> nn.Module:
@@ -66,12 +72,15 @@ class ChunkErrors(NamedTuple):
         regression: (B, T), what the loss takes of translations (and rotations).
         gripper: (B, T), binary cross-entropy or squared error.
         n_valid: (B,) steps that are not padded.
+        points: (B,), how far along x and y the readout's points are from theirs, where half the image is 1; 0 for a
+            readout that finds none.
     """
 
     offset: Tensor
     regression: Tensor
     gripper: Tensor
     n_valid: Tensor
+    points: Tensor
 
     def regression_loss(self) -> Tensor:
         return self.regression.sum() / self.n_valid.sum()
@@ -79,25 +88,35 @@ class ChunkErrors(NamedTuple):
     def gripper_loss(self) -> Tensor:
         return self.gripper.sum() / self.n_valid.sum()
 
-    def loss(self, regression_weight: float) -> Tensor:
+    def loss(self, regression_weight: float, point_weight: float) -> Tensor:
         """The mean over all valid steps."""
-        return regression_weight * self.regression_loss() + self.gripper_loss()
+        chunks = regression_weight * self.regression_loss() + self.gripper_loss()
+        return chunks + point_weight * self.points.mean()
 
-    def loss_per_sample(self, regression_weight: float) -> Tensor:
+    def loss_per_sample(self, regression_weight: float, point_weight: float) -> Tensor:
         """The mean over each sample's valid steps, (B,)."""
         errors = regression_weight * self.regression + self.gripper
-        return errors.sum(dim=1) / self.n_valid.clamp(min=1)
+        return errors.sum(dim=1) / self.n_valid.clamp(min=1) + point_weight * self.points
 
 
 def chunk_errors(
-    raw: Tensor, target: Tensor, padded: Tensor, gripper_head: str, regression_loss: str = "mse"
+    raw: Tensor,
+    read: Tensor,
+    target: Tensor,
+    padded: Tensor,
+    points: Tensor | None = None,
+    *,
+    gripper_head: str,
+    regression_loss: str = "mse",
 ) -> ChunkErrors:
     """Compare what the heads returned with actions.
 
     Args:
         raw: (B, T, A), from `ChunkHeads`.
+        read: (B, ...), what its readout made.
         target: (B, T, A), the gripper +1 or -1.
         padded: (B, T), true for steps beyond an episode's end.
+        points: (B, 2P), x and y of the readout's points, from -1 to 1; None where it finds none.
         gripper_head: "bce" or "regression".
         regression_loss: one of `REGRESSION_LOSSES`.
     """
@@ -107,4 +126,6 @@ def chunk_errors(
         gripper = (raw[..., -1] - target[..., -1]).pow(2)
     else:
         gripper = F.binary_cross_entropy_with_logits(raw[..., -1], (target[..., -1] + 1) / 2, reduction="none")
-    return ChunkErrors(offset, regression, gripper.masked_fill(padded, 0.0), (~padded).sum(dim=1))
+    n_valid = (~padded).sum(dim=1)
+    astray = torch.zeros_like(read[..., 0]) if points is None else (read / POINT_SCALE - points).abs().mean(dim=-1)
+    return ChunkErrors(offset, regression, gripper.masked_fill(padded, 0.0), n_valid, astray)

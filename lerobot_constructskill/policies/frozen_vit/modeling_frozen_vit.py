@@ -3,7 +3,7 @@
 import json
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -130,8 +130,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             logs |= self._heldout_report
         else:
             self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
+        if self.readout.points:
+            self.check_points(batch)
+            logs["point_loss"] = errors.points.mean().item()
         loss = errors.loss_per_sample if reduction == "none" else errors.loss
-        return loss(self.config.regression_weight), logs
+        return loss(self.config.regression_weight, self.config.point_weight), logs
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
         """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
@@ -294,6 +297,18 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._check_column(self.config.backbone_sha256)
         self._find_patches(meta.root)
 
+    def check_points(self, columns: Collection[str]) -> None:
+        """Refuse to learn from a data set or batch that lacks what the readout learns from.
+
+        Raises:
+            ValueError: it finds points, and where they are is in none of the columns.
+        """
+        if self.readout.points and self.config.point_key not in columns:
+            raise InputError(
+                f"readout={self.config.readout} learns from {self.config.point_key}: train on a feature set that "
+                "constructskill-encode made with --patches=true --points=true."
+            )
+
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
 
@@ -324,10 +339,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _chunk_errors(self, batch: dict[str, Tensor]) -> ChunkErrors:
         padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
-        config = self.config
-        return chunk_errors(self._raw_chunk(batch), batch[ACTION], padded, config.gripper_head, config.regression_loss)
+        points = batch.get(self.config.point_key) if self.readout.points else None
+        return chunk_errors(*self._heads_on(batch), batch[ACTION], padded, points, **self.config.losses)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        return self._heads_on(batch)[0]
+
+    def _heads_on(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         return self.heads(*self.head_inputs(batch))
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:

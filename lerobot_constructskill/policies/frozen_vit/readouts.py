@@ -12,6 +12,12 @@ KEYPOINTS = 32
 QUERIES = 4
 """Learned queries of `attention`."""
 
+POINTS = ("object", "receptacle", "hand")
+"""What `heat_maps` finds, in this order."""
+
+POINT_SCALE = 8.0
+"""Of its positions: where the whole image is from -1 to 1, the millimetres that count are lost on the heads."""
+
 
 def _keep(dim: int) -> nn.Module:
     """What is pooled is the vector."""
@@ -27,12 +33,15 @@ class Readout:
         build: `D -> module` that trains with the heads and makes one vector of what `pool` took.
         dim: `D -> length` of that vector.
         reads_patches: whether `pool` looks at the patches at all.
+        points: what it finds in the image, and is told in training where to find: the numbers that `build` makes are
+            their x and y, from `-POINT_SCALE` to `POINT_SCALE`.
     """
 
     pool: Callable[[Tensor, Tensor], Tensor]
     dim: Callable[[int], int]
     build: Callable[[int], nn.Module] = _keep
     reads_patches: bool = True
+    points: tuple[str, ...] = ()
 
     @property
     def learns(self) -> bool:
@@ -59,6 +68,30 @@ class SpatialSoftmax(nn.Module):
         attention = self.patterns(patches).softmax(dim=-2)
         positions = attention.transpose(-1, -2) @ _grid(patches.shape[-2]).to(patches)
         return positions.flatten(-2)
+
+
+class HeatMaps(nn.Module):
+    """Where in the image some things are: the expected position under a heat map of each.
+
+    A hidden layer draws the maps, one patch at a time; `SpatialSoftmax` has none. In training they are told where the
+    things are, as the first layers of Levine et al. 2016 (End-to-End Training of Deep Visuomotor Policies) and the
+    auxiliary losses of Zhang et al. 2018 (Deep Imitation Learning for Complex Manipulation Tasks).
+
+    Args:
+        dim: length D of a patch feature.
+        hidden_dim: width of the hidden layer.
+    """
+
+    def __init__(self, dim: int, hidden_dim: int = 32):
+        super().__init__()
+        hidden = nn.Linear(dim, hidden_dim), nn.GELU()
+        self.maps = nn.Sequential(*hidden, nn.Linear(hidden_dim, len(POINTS), bias=False))
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """Return (B, 2P) for patches (B, N, D) of a square grid: x then y of each point, times `POINT_SCALE`."""
+        maps = self.maps(patches).softmax(dim=-2)
+        positions = maps.transpose(-1, -2) @ _grid(patches.shape[-2]).to(patches)
+        return POINT_SCALE * positions.flatten(-2)
 
 
 class AttentionPooling(nn.Module):
@@ -93,4 +126,5 @@ READOUTS = {
     "cls_mean": Readout(lambda cls, patches: torch.cat([cls, patches.mean(dim=1)], dim=-1), lambda dim: 2 * dim),
     "spatial_softmax": Readout(lambda cls, patches: patches, lambda dim: 2 * KEYPOINTS, SpatialSoftmax),
     "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, AttentionPooling),
+    "heat_maps": Readout(lambda cls, patches: patches, lambda dim: 2 * len(POINTS), HeatMaps, points=POINTS),
 }

@@ -45,7 +45,8 @@ def train_seeds(
         held_out: numbers of the episodes that are.
 
     Raises:
-        ValueError: the data set has images in place of features, or they are another encoder's.
+        ValueError: the data set has images in place of features, they are another encoder's, or it does not say where
+            the points are that the readout learns to find.
     """
     template = make_policy(deepcopy(config), ds_meta=dataset.meta)
     if template.config.feature_column is None:
@@ -53,6 +54,7 @@ def train_seeds(
             f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
             "constructskill-encode makes of a data set."
         )
+    template.check_points(dataset.meta.features)
     preprocess, _ = make_pre_post_processors(template.config, dataset_stats=dataset.meta.stats)
     table = _read_table(template, dataset, preprocess)
     inputs = _head_inputs(template, table)
@@ -131,9 +133,13 @@ def _episodes(dataset: LeRobotDataset) -> Tensor:
 def _read_table(
     policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, preprocess: Callable[[dict], dict]
 ) -> dict[str, Tensor]:
-    """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T)."""
+    """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T).
+
+    Where the readout finds points and the set says where they are, also those.
+    """
     columns = dataset.hf_dataset.with_format("numpy")
-    names = policy.config.feature_key, "index", *policy.config.input_features
+    points = [policy.config.point_key] if policy.readout.points else []
+    names = policy.config.feature_key, "index", *policy.config.input_features, *points
     table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
     rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
     table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
@@ -189,8 +195,8 @@ def _step_together(
     orders: Sequence[_Order],
 ) -> None:
     """Train `heads` in place."""
-    preset, weight = config.get_optimizer_preset(), config.regression_weight
-    kinds = config.gripper_head, config.regression_loss
+    preset, weights = config.get_optimizer_preset(), (config.regression_weight, config.point_weight)
+    labels = [table[name] for name in (ACTION, f"{ACTION}_is_pad", config.point_key) if name in table]
     stacked, _ = stack_module_state(list(heads))
     parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
     optimizer = preset.build(list(parameters.values()))
@@ -200,10 +206,10 @@ def _step_together(
     most = sum(min(order.batch_size, len(order.rows)) for order in orders)
     columns = [_Column(values, most, config.device) for values in inputs]
     for batch in Progress(_batches(orders), f"training {len(heads)} seeds", n_steps, unit="step"):
-        target, padded = table[ACTION][batch], table[f"{ACTION}_is_pad"][batch]
+        wanted = [label[batch] for label in labels]
         seen = [column.read(batch) for column in columns]
-        raw = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
-        losses = vmap(lambda *chunk: chunk_errors(*chunk, *kinds).loss(weight))(raw, target, padded)
+        made = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
+        losses = vmap(lambda *chunk: chunk_errors(*chunk, **config.losses).loss(*weights))(*made, *wanted)
         optimizer.zero_grad()
         losses.sum().backward()
         _clip_each(parameters.values(), preset.grad_clip_norm)

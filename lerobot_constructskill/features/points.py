@@ -1,0 +1,81 @@
+"""Where a camera's picture shows what a readout learns to find, from a data set's privileged state."""
+
+from collections.abc import Mapping
+from math import tan
+
+import numpy as np
+
+from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, Camera
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.policies.frozen_vit.encoder import Crop
+from lerobot_constructskill.policies.frozen_vit.readouts import POINTS
+
+POSES = dict(zip(POINTS, ("sim.object_pose", "sim.bin_position", "sim.tcp_pose"), strict=True))
+"""Column whose first three numbers are a point's position, in metres in the world's frame."""
+
+TCP_IN_HAND = np.array([0.0, 0.0, 0.1034])
+"""The point between the Panda's fingertips in the frame of its link `panda_hand`, in metres."""
+
+
+def find_points(columns: Mapping[str, np.ndarray], camera: str, crop: Crop | None = None) -> np.ndarray:
+    """Return (N, 2P) float32: x to the right and y down of each point in the cropped picture, from -1 to 1.
+
+    A point outside the picture is where its edge is nearest.
+
+    Args:
+        columns: the data set's, by name, (N, ...) each.
+        camera: one of `contract.CAMERAS`.
+        crop: the part of the picture that is encoded.
+
+    Raises:
+        ValueError: the data set does not say where things are, or no such camera is known.
+    """
+    missing = sorted({*POSES.values()} - {*columns})
+    if missing:
+        raise InputError(
+            f"The data set does not say where things are (it has no {', '.join(missing)}), as this benchmark's "
+            "demonstrations do: encode it without points, for a readout other than heat_maps."
+        )
+    if camera not in CAMERAS:
+        raise InputError(f"Where '{camera}' looks from is not known; points are for {', '.join(CAMERAS)}.")
+    hands = np.stack(columns[POSES["hand"]]).astype(float)
+    positions = [np.stack(columns[POSES[name]]).astype(float)[:, :3] for name in POINTS]
+    seen = [_cropped(_project(CAMERAS[camera], position, hands), crop) for position in positions]
+    return np.concatenate(seen, axis=1).clip(-1, 1).astype(np.float32)
+
+
+def _project(camera: Camera, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
+    """Where a square picture shows world positions (N, 3): (N, 2), half the picture is 1."""
+    right, down, forward = _axes(camera)
+    if camera.mount is None:
+        offsets = positions - camera.eye
+    else:
+        links = hands[:, :3] - _rotate(hands[:, 3:], TCP_IN_HAND)
+        offsets = _rotate(hands[:, 3:] * [1, -1, -1, -1], positions - links) - camera.eye
+    depth = np.maximum(offsets @ forward, 1e-3)
+    return np.stack([offsets @ right, offsets @ down], axis=1) / depth[:, None] / tan(camera.fov / 2)
+
+
+def _axes(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """To the right, down and forward: in the world, or in the frame of a link along whose z the camera looks."""
+    if camera.mount is not None:
+        return np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    forward = np.subtract(camera.target, camera.eye)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    return right, np.cross(forward, right), forward
+
+
+def _rotate(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (N, 3), or one (3,), turned by unit quaternions (w, x, y, z)."""
+    w, axis = quaternions[:, :1], quaternions[:, 1:]
+    return vectors + 2 * np.cross(axis, np.cross(axis, vectors) + w * vectors)
+
+
+def _cropped(positions: np.ndarray, crop: Crop | None) -> np.ndarray:
+    """Positions in a picture as positions in the part of it that `FrozenEncoder` looks at."""
+    if crop is None:
+        return positions
+    left, top, right, bottom = (round(edge * IMAGE_SIZE) / IMAGE_SIZE * 2 - 1 for edge in crop)
+    middle = np.array([left + right, top + bottom]) / 2
+    return (positions - middle) / (np.array([right - left, bottom - top]) / 2)
