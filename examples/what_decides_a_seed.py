@@ -116,7 +116,7 @@ def disagreement(policies: list[FrozenViTChunkPolicy], frames: list[np.ndarray])
     """How far the seeds' next translations lie from their mean, on the same frames, in metres."""
     images = torch.from_numpy(np.stack(frames)).permute(0, 3, 1, 2) / 255
     pooled = policies[0].pool(images)
-    moves = torch.stack([policy.heads(pooled)[:, 0, :3] for policy in policies])
+    moves = torch.stack([policy.heads(pooled)[0][:, 0, :3] for policy in policies])
     return (moves - moves.mean(dim=0)).pow(2).mean().sqrt().item()
 
 

@@ -12,7 +12,7 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe
-from lerobot_constructskill.policies.frozen_vit.readouts import POINTS
+from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 
 TINY = "vit_tiny16"
@@ -50,7 +50,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
     column = {"dtype": "float32", "shape": (dim,), "names": None, "info": info}
     features = {
         "observation.features.base": column,
-        "observation.points.base": {"dtype": "float32", "shape": (2 * len(POINTS),), "names": None},
+        "observation.points.base": {"dtype": "float32", "shape": (len(POINT_NAMES),), "names": POINT_NAMES},
         "observation.state": {"dtype": "float32", "shape": (8,), "names": [f"s{i}" for i in range(8)]},
         "action": {"dtype": "float32", "shape": (4,), "names": ["dx", "dy", "dz", "gripper"]},
     }
@@ -65,7 +65,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
             dataset.add_frame(
                 {
                     "observation.features.base": feature.astype(np.float32),
-                    "observation.points.base": rng.uniform(-1, 1, 2 * len(POINTS)).astype(np.float32),
+                    "observation.points.base": rng.uniform(-1, 1, len(POINT_NAMES)).astype(np.float32),
                     "observation.state": rng.normal(size=8).astype(np.float32),
                     "action": action.astype(np.float32),
                     "task": "a task",

@@ -21,6 +21,7 @@ from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key, point_key
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
+from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
 from lerobot_constructskill.progress import Progress, quiet
 
@@ -205,6 +206,8 @@ def _write_copy(
     made = {key: features, **points}
     columns = {name: {"dtype": "float32", "shape": (of.shape[1],), "names": None} for name, of in made.items()}
     columns[key]["info"] = info
+    if points:
+        columns[point_key(camera)]["names"] = POINT_NAMES
     with quiet():
         added = {name: (of, columns[name]) for name, of in made.items()}
         copy = modify_features(dataset, added, _left_out(dataset), folder, repo_id)

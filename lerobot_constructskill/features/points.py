@@ -18,7 +18,7 @@ TCP_IN_HAND = np.array([0.0, 0.0, 0.1034])
 
 
 def find_points(columns: Mapping[str, np.ndarray], camera: str, crop: Crop | None = None) -> np.ndarray:
-    """Return (N, 2P) float32: x to the right and y down of each point in the cropped picture, from -1 to 1.
+    """Return (N, 2P) float32, `readouts.POINT_NAMES` in the cropped picture, from -1 to 1.
 
     A point outside the picture is where its edge is nearest.
 

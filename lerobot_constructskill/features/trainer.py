@@ -224,7 +224,7 @@ def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDatas
 def _beside(config: FrozenViTChunkConfig) -> dict[str, bool]:
     """What a feature set needs beside the pooled features, for the policy's readout to learn."""
     readout = READOUTS[config.readout]
-    return {"patches": readout.reads_patches} | ({"points": True} if readout.points else {})
+    return {"patches": readout.reads_patches} | ({"points": [*readout.points]} if readout.points else {})
 
 
 def _precision(config: FrozenViTChunkConfig) -> str:

@@ -47,7 +47,8 @@ def encode(config: EncodeConfig) -> Path:
     """Encode a data set and return the folder of the feature set; a killed run continues with its next episode.
 
     Raises:
-        ValueError: unknown backbone, precision or camera, or damaged weights.
+        ValueError: unknown backbone, precision or camera, damaged weights, or a data set that does not say where its
+            points are.
         FileExistsError: the output folder exists.
         FileNotFoundError: the data set or the backbone's weights cannot be had.
         OSError: the output folder cannot be written, which shows before anything is encoded.

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,18 +117,20 @@ def test_killed_at_several_stages_it_ends_in_the_same_bytes(made, settings, tmp_
     assert hashes(tmp_path / "set") == hashes(made[0])
 
 
-def test_joined_features_are_those_of_the_whole_set_encoded(made, settings):
+@pytest.mark.parametrize("readout", ["heat_maps", "spatial_softmax"])
+def test_joined_features_are_those_of_the_whole_set_encoded(readout, made, settings):
     config = parse(DaggerConfig, ["--repo_id=local/driven"], settings)
     plan, store = Plan(config), Store(settings.parent / "store")
+    policy = replace(plan.policy, readout=readout)
     whole, parts = obtain_data(plan, ROUNDS, store), parts_of(plan, ROUNDS, store)
-    folder = store.folder(features_artifact(plan.policy, whole))
-    with FeatureTrainer().joined(plan.policy, whole, parts, store):
+    folder = store.folder(features_artifact(policy, whole))
+    with FeatureTrainer().joined(policy, whole, parts, store):
         joined = hashes(folder)
     assert not folder.exists()
-    with pytest.raises(MemoryError), FeatureTrainer().joined(plan.policy, whole, parts, store):
+    with pytest.raises(MemoryError), FeatureTrainer().joined(policy, whole, parts, store):
         raise MemoryError
     assert not folder.exists()
-    obtain_features(plan.policy, whole, store)
+    obtain_features(policy, whole, store)
     assert joined == hashes(folder)
 
 

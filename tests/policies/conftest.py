@@ -13,7 +13,7 @@ from torch import Tensor
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
-from lerobot_constructskill.policies.frozen_vit.readouts import POINTS
+from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.shared_eyes import POOLED
 
 TINY = "vit_tiny16"
@@ -78,7 +78,7 @@ def make_batch() -> Callable[..., Batch]:
             "observation.state": torch.randn(size, 8, generator=rng),
             "action": action,
             "action_is_pad": padded,
-            "observation.points.base": torch.rand(size, 2 * len(POINTS), generator=rng) * 2 - 1,
+            "observation.points.base": torch.rand(size, len(POINT_NAMES), generator=rng) * 2 - 1,
         }
 
     return make

@@ -89,12 +89,12 @@ class ChunkErrors(NamedTuple):
         return self.gripper.sum() / self.n_valid.sum()
 
     def loss(self, regression_weight: float, point_weight: float) -> Tensor:
-        """The mean over all valid steps."""
+        """The mean over all valid steps, and of points over all samples."""
         chunks = regression_weight * self.regression_loss() + self.gripper_loss()
         return chunks + point_weight * self.points.mean()
 
     def loss_per_sample(self, regression_weight: float, point_weight: float) -> Tensor:
-        """The mean over each sample's valid steps, (B,)."""
+        """The mean over each sample's valid steps, and that of its points, (B,)."""
         errors = regression_weight * self.regression + self.gripper
         return errors.sum(dim=1) / self.n_valid.clamp(min=1) + point_weight * self.points
 
@@ -116,7 +116,7 @@ def chunk_errors(
         read: (B, ...), what its readout made.
         target: (B, T, A), the gripper +1 or -1.
         padded: (B, T), true for steps beyond an episode's end.
-        points: (B, 2P), x and y of the readout's points, from -1 to 1; None where it finds none.
+        points: (B, 2P), x and y of the readout's points, from -1 to 1; None where it finds none or none is told.
         gripper_head: "bce" or "regression".
         regression_loss: one of `REGRESSION_LOSSES`.
     """

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,8 +43,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     Raises:
         FileNotFoundError: the backbone's weights cannot be had, or the readout's patch features are not there.
-        ValueError: the data set's features are another encoder's, its rate is another than the policy's, or the inputs
-            do not fit the configuration.
+        ValueError: the data set's features are another encoder's, its rate is another than the policy's, it does not
+            say where the points are that the readout learns to find, or the inputs do not fit the configuration.
     """
 
     config_class = FrozenViTChunkConfig
@@ -75,6 +75,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             self._load_backbone()
         self._check_column(config.backbone_sha256)
         self.readout = READOUTS[config.readout]
+        if dataset_meta is not None:
+            self._check_points(dataset_meta.features)
         self._find_patches(dataset_meta.root if dataset_meta is not None else None)
         self.heads = self.fresh_heads()
 
@@ -115,8 +117,9 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """Return the loss on a batch of chunks.
 
         Args:
-            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T).
-            reduction: "mean" over all valid steps, or "none" for one loss per sample (B,).
+            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
+                that finds points also where they are, (B, 2P).
+            reduction: "mean" over all valid steps (of points over samples), or "none" for one loss per sample (B,).
 
         Returns:
             The loss, and its terms as floats. In evaluation mode the translation error is also accumulated, and
@@ -131,7 +134,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         else:
             self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
         if self.readout.points:
-            self.check_points(batch)
+            if self.config.point_key not in batch:
+                raise self._untold()
             logs["point_loss"] = errors.points.mean().item()
         loss = errors.loss_per_sample if reduction == "none" else errors.loss
         return loss(self.config.regression_weight, self.config.point_weight), logs
@@ -213,6 +217,18 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if config.feature_column is not None:
             made_by = describe(spec, sha256, config.backbone_trained_precision, config.crop, config.blind)
             check_features(config.feature_column, made_by, spec.feature_dim)
+
+    def _check_points(self, features: Mapping[str, Mapping]) -> None:
+        """Refuse a data set that does not say where the points are that the readout learns to find."""
+        found = features.get(self.config.point_key, {}).get("names")
+        if self.readout.points and found != [*self.readout.points]:
+            raise self._untold()
+
+    def _untold(self) -> InputError:
+        return InputError(
+            f"readout={self.config.readout} learns from {self.config.point_key} ({', '.join(self.readout.points)}): "
+            "train on a feature set that constructskill-encode makes with --patches=true --points=true."
+        )
 
     def _find_patches(self, root: Path | None) -> None:
         """Know where a data set's patch features lie, and that they are there if they are to be read."""
@@ -296,18 +312,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.config.set_dataset_feature_metadata(meta.features)
         self._check_column(self.config.backbone_sha256)
         self._find_patches(meta.root)
-
-    def check_points(self, columns: Collection[str]) -> None:
-        """Refuse to learn from a data set or batch that lacks what the readout learns from.
-
-        Raises:
-            ValueError: it finds points, and where they are is in none of the columns.
-        """
-        if self.readout.points and self.config.point_key not in columns:
-            raise InputError(
-                f"readout={self.config.readout} learns from {self.config.point_key}: train on a feature set that "
-                "constructskill-encode made with --patches=true --points=true."
-            )
 
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].

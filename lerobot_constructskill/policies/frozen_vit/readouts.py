@@ -1,6 +1,6 @@
 """From an encoder's tokens to the one vector that the linear heads see: one entry of `READOUTS` each."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,6 +14,9 @@ QUERIES = 4
 
 POINTS = ("object", "receptacle", "hand")
 """What `heat_maps` finds, in this order."""
+
+POINT_NAMES = [f"{point}.{axis}" for point in POINTS for axis in "xy"]
+"""The numbers that say where they are: x to the right, y down."""
 
 POINT_SCALE = 8.0
 """Of its positions: where the whole image is from -1 to 1, the millimetres that count are lost on the heads."""
@@ -33,15 +36,15 @@ class Readout:
         build: `D -> module` that trains with the heads and makes one vector of what `pool` took.
         dim: `D -> length` of that vector.
         reads_patches: whether `pool` looks at the patches at all.
-        points: what it finds in the image, and is told in training where to find: the numbers that `build` makes are
-            their x and y, from `-POINT_SCALE` to `POINT_SCALE`.
+        points: names of the numbers that say where in the image things are. It is told them in training, from -1 to 1,
+            and what `build` makes are these numbers times `POINT_SCALE`.
     """
 
     pool: Callable[[Tensor, Tensor], Tensor]
     dim: Callable[[int], int]
     build: Callable[[int], nn.Module] = _keep
     reads_patches: bool = True
-    points: tuple[str, ...] = ()
+    points: Sequence[str] = ()
 
     @property
     def learns(self) -> bool:
@@ -126,5 +129,5 @@ READOUTS = {
     "cls_mean": Readout(lambda cls, patches: torch.cat([cls, patches.mean(dim=1)], dim=-1), lambda dim: 2 * dim),
     "spatial_softmax": Readout(lambda cls, patches: patches, lambda dim: 2 * KEYPOINTS, SpatialSoftmax),
     "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, AttentionPooling),
-    "heat_maps": Readout(lambda cls, patches: patches, lambda dim: 2 * len(POINTS), HeatMaps, points=POINTS),
+    "heat_maps": Readout(lambda cls, patches: patches, lambda dim: 2 * len(POINTS), HeatMaps, points=POINT_NAMES),
 }

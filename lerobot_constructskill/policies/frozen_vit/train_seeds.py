@@ -54,7 +54,6 @@ def train_seeds(
             f"'{dataset.repo_id}' has no {template.config.feature_key}: seeds train together on features, which "
             "constructskill-encode makes of a data set."
         )
-    template.check_points(dataset.meta.features)
     preprocess, _ = make_pre_post_processors(template.config, dataset_stats=dataset.meta.stats)
     table = _read_table(template, dataset, preprocess)
     inputs = _head_inputs(template, table)
@@ -135,12 +134,13 @@ def _read_table(
 ) -> dict[str, Tensor]:
     """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T).
 
-    Where the readout finds points and the set says where they are, also those.
+    Where the readout finds points, also where they are, (N, 2P).
     """
     columns = dataset.hf_dataset.with_format("numpy")
-    points = [policy.config.point_key] if policy.readout.points else []
-    names = policy.config.feature_key, "index", *policy.config.input_features, *points
+    names = policy.config.feature_key, "index", *policy.config.input_features
     table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
+    if policy.readout.points:
+        table[policy.config.point_key] = torch.as_tensor(columns[policy.config.point_key][:])
     rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
     table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
     table[f"{ACTION}_is_pad"] = rows > last
