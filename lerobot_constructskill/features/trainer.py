@@ -211,20 +211,21 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
 
 def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset) -> Artifact:
     """What `obtain_features` returns. Raises as it does."""
-    spec = get_backbone(config.backbone, config.backbone_path)
+    spec, points = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].points
     if config.backbone_sha256 is None:
         load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
-    return Artifact("features", {**source, **_beside(config), "encoder": made_by, "versions": made_in})
+    beside = {"patches": _beside(config)["patches"]} | ({"points": [*points]} if points else {})
+    return Artifact("features", {**source, **beside, "encoder": made_by, "versions": made_in})
 
 
 def _beside(config: FrozenViTChunkConfig) -> dict[str, bool]:
-    """What a feature set needs beside the pooled features, for the policy's readout to learn."""
+    """What a feature set has beside the pooled features, for the policy's readout to learn from."""
     readout = READOUTS[config.readout]
-    return {"patches": readout.reads_patches} | ({"points": [*readout.points]} if readout.points else {})
+    return {"patches": readout.reads_patches, "points": bool(readout.points)}
 
 
 def _precision(config: FrozenViTChunkConfig) -> str:
