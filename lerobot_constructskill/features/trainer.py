@@ -211,14 +211,14 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
 
 def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset) -> Artifact:
     """What `obtain_features` returns. Raises as it does."""
-    spec, points = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout].points
+    spec, readout = get_backbone(config.backbone, config.backbone_path), READOUTS[config.readout]
     if config.backbone_sha256 is None:
         load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
-    beside = {"patches": _beside(config)["patches"]} | ({"points": [*points]} if points else {})
+    beside = {"patches": readout.reads_patches} | ({"points": [*readout.points]} if readout.points else {})
     return Artifact("features", {**source, **beside, "encoder": made_by, "versions": made_in})
 
 
