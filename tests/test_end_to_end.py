@@ -1,8 +1,6 @@
 """The whole path with LeRobot's own scripts, as subprocesses: generate, encode, train, resume, evaluate."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,7 +126,7 @@ def test_dart_noise_is_fitted_to_a_policy_and_generates_the_next_set(trained, de
     root, repo_id = (flag.split("=")[1] for flag in demonstrations)
     source = [f"--repo_id={repo_id}", f"--root={root}", "--episodes=[1]"]
     flags = [f"--policy_path={checkpoint}", *source, f"--out={fitted}"]
-    subprocess.run([sys.executable, "-m", "lerobot_constructskill.scripts.fit_noise", *flags], check=True)
+    call("constructskill-fit-noise", *flags)
     config = draccus.parse(GenerateConfig, fitted, args=["--repo_id=local/dart"])
     assert config.noise.model == "dart" and config.noise.fitted_on["iteration"] == "1"
     assert 0.0005 < np.sqrt(np.diag(config.noise.covariance)).max() < 0.1

@@ -11,11 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import OFFLINE, warm_bin
 from printed import PAGES, commands
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
-
-BIN = Path(sys.executable).parent
 
 SHORT = {
     "constructskill-generate": "--episodes=2",
@@ -73,11 +72,10 @@ def reader(tmp_path_factory) -> tuple[Path, dict[str, str]]:
     keep_resnet(cache / "hub" / "checkpoints")
     for name, flags in SHORT.items():
         behind = " ".join(map(shlex.quote, flags.split()))
-        (wrappers / name).write_text(f'#!/bin/sh\nexec "{BIN / name}" "$@" {behind}\n')
+        (wrappers / name).write_text(f'#!/bin/sh\nexec "{warm_bin() / name}" "$@" {behind}\n')
         (wrappers / name).chmod(0o755)
-    path = f"{wrappers}:{BIN}:{os.environ['PATH']}"
-    offline = {"HF_HUB_OFFLINE": "1", "TORCH_HOME": str(cache)}
-    return folder, os.environ | offline | {"PATH": path, "CUDA_VISIBLE_DEVICES": ""}
+    path = f"{wrappers}:{warm_bin()}:{Path(sys.executable).parent}:{os.environ['PATH']}"
+    return folder, os.environ | OFFLINE | {"TORCH_HOME": str(cache), "PATH": path}
 
 
 def keep_resnet(folder: Path) -> None:
