@@ -110,6 +110,16 @@ def policy_config(weights: Path, **fields: object) -> FrozenViTChunkConfig:
     return FrozenViTChunkConfig(device="cpu", **fields)
 
 
+def test_a_device_on_which_the_batch_shows_has_its_own_and_says_so(source, weights, tmp_path, monkeypatch):
+    """As a GPU does; on a CPU a set says nothing of it."""
+    sizes, encode_batch = set(), features_encode._encode
+    monkeypatch.setattr(features_encode, "_encode", lambda *given: sizes.add(len(given[1])) or encode_batch(*given))
+    monkeypatch.setattr(features_encode, "BATCHES", {"cpu": 3})
+    encode(settings(source, weights, tmp_path / "out", batch_size=None))
+    info = LeRobotDataset("local/out", root=tmp_path / "out").meta.features[KEY]["info"]
+    assert max(sizes) == 3 and info.items() >= features_encode.batch_facts("cpu").items() == {("batch_size", "3")}
+
+
 @STORED
 def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encoded):
     assert {name for name in encoded.meta.features if "." in name} == {"observation.state", KEY}
@@ -125,6 +135,7 @@ def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encod
                 else before[name] == after[name]
             )
     assert encoded.meta.stats[KEY]["mean"].shape == (192,)
+    assert "batch_size" not in encoded.meta.features[KEY]["info"]
 
 
 @STORED
