@@ -24,7 +24,7 @@ from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_tensors, state_sha256
 
 LARGE = ("clip_vitb16", "dinov2_vits14")
-THREE_WAYS = ("--policy.backbone_path=", "hf download ", "[offline]")
+THREE_WAYS = ("with backbone_path=", "hf download ", "[offline]")
 
 
 def by_cost(name: str, *others):

@@ -49,7 +49,7 @@ def test_bfloat16_by_name_is_refused_where_it_would_be_emulated(machine, make_po
         lambda: make_policy(backbone_precision="bfloat16"),
         lambda: load_encoder("vit_tiny16", str(weights("vit_tiny16")), "bfloat16"),
     ):
-        with pytest.raises(ValueError, match="60 times slower .* --policy.backbone_precision=float32") as refusal:
+        with pytest.raises(ValueError, match="60 times slower .* use backbone_precision=float32") as refusal:
             call()
         assert "\n" not in str(refusal.value)
         assert isinstance(refusal.value, MachineError), "a study stops there; it is no result of a run"

@@ -226,7 +226,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if fps != self.fps:
             raise InputError(
                 f"The data set has {fps} frames a second and the policy acts at {self.fps} Hz: train on a set of that "
-                "rate, or say --policy.fps if what it is for runs at another."
+                "rate, or set fps if what it is for runs at another."
             )
 
     def validate_features(self) -> None:
@@ -242,7 +242,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if self.image_key not in inputs and self.feature_key not in inputs:
             raise InputError(
                 f"frozen_vit needs {self.image_key} or {self.feature_key}; the inputs are: "
-                f"{', '.join(inputs) or 'none'} (choose another camera with --policy.camera)."
+                f"{', '.join(inputs) or 'none'} (choose another camera)."
             )
         if self.use_state and OBS_STATE not in inputs:
             raise InputError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")

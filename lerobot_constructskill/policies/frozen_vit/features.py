@@ -44,7 +44,7 @@ def open_patches(root: Path) -> Tensor:
     if not file.exists():
         raise MissingError(
             f"The feature set in {root} has no {PATCHES_FILE}, which this readout needs: encode the data set with "
-            "constructskill-encode --patches=true, or, if it is from the Hub, download it whole (--dataset.root)."
+            "constructskill-encode --patches=true, or, if it is from the Hub, download it whole and give its folder."
         )
     return _mapped(file)
 

@@ -333,7 +333,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if not self.config.use_state:
             return (pooled,)
         if OBS_STATE not in batch:
-            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which --env.obs_type=pixels_agent_pos shows.")
+            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
         return pooled, batch[OBS_STATE]
 
     @torch.no_grad()

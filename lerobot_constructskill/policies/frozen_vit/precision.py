@@ -63,7 +63,7 @@ def check_native(precision: str, device: torch.device | str) -> None:
     if not is_native(precision, device):
         raise NotNativeError(
             f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
-            f"--policy.backbone_precision=float32, with which what was made in {precision} runs as well and logs "
+            f"backbone_precision=float32, with which what was made in {precision} runs as well and logs "
             "how far its features drift."
         )
 
