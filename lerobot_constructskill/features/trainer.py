@@ -65,7 +65,8 @@ class FeatureTrainer:
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
 
     def idle(self, config: FrozenViTChunkConfig) -> tuple[str, ...]:
-        return () if READOUTS[config.readout].points else ("point_weight",)
+        written = ("backbone_trained_runtime",)
+        return written if READOUTS[config.readout].points else (*written, "point_weight")
 
     def settled_elsewhere(self, config: FrozenViTChunkConfig) -> list[dict[str, Any]]:
         """The precisions that `auto` means on other machines."""

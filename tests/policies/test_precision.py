@@ -85,6 +85,7 @@ def test_what_is_trained_further_on_images_is_of_the_precision_it_saw(machine, m
     policy = make_policy(backbone_precision="float32", backbone_trained_precision="bfloat16")
     assert policy.eval().config.backbone_trained_precision == "bfloat16"
     assert policy.train().config.backbone_trained_precision == "float32"
+    assert policy.config.backbone_trained_runtime == policy.backbone.runtime
 
 
 @pytest.mark.slow
@@ -106,7 +107,18 @@ def test_under_the_other_kinds_instructions_float32_is_close_to_ours(weights, im
 
 def test_a_blind_encoder_drifts_as_far_as_its_features_of_grey(images):
     encoder = FrozenEncoder(BACKBONES["vit_tiny16"], "float32", blind=True)
-    assert encoder.drift(images, "float32") < 1e-3
+    assert encoder.drift(images, "float32") < 1e-3 and encoder.drift(images, "float32", on_cpu=True) < 1e-3
+
+
+def test_features_of_a_cpu_are_told_apart_from_those_of_a_gpu(make_policy, images, monkeypatch, caplog):
+    policy = make_policy(backbone_precision="float32", backbone_trained_runtime="openvino")
+    policy._log_crossing(images)
+    assert not caplog.text
+    monkeypatch.setattr(FrozenEncoder, "device", torch.device("cuda"))
+    monkeypatch.setattr(FrozenEncoder, "drift", lambda self, images, precision, on_cpu: 0.005 * on_cpu)
+    policy._log_crossing(images)
+    assert "trained on features of a CPU in float32, acts on features of cuda in float32; on its" in caplog.text
+    assert "differ by 0.5 % of" in caplog.text
 
 
 @pytest.fixture

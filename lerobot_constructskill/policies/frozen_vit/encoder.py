@@ -1,6 +1,7 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -98,15 +99,20 @@ class FrozenEncoder(nn.Module):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()
 
-    def drift(self, images: Tensor, precision: str) -> float:
-        """How far the patch features of images are from those in another precision, in shares of their norm.
+    def drift(self, images: Tensor, precision: str, on_cpu: bool = False) -> float:
+        """How far the patch features of images are from others, in shares of the others' norm.
 
-        PyTorch computes the other ones, also where they have to be emulated.
+        PyTorch computes the others, also where it has to emulate their precision.
+
+        Args:
+            precision: that of the others.
+            on_cpu: whether a CPU computes the others, instead of this encoder's own device.
         """
         if self.blind:
             images = torch.full_like(images[:1].float(), GREY)
-        ours = self.encode(images)[1]
-        theirs = self._encode_eagerly(images, precision)[1]
+        ours = self.encode(images)[1].cpu()
+        other = deepcopy(self).cpu() if on_cpu else self
+        theirs = other._encode_eagerly(images.to(other.device), precision)[1].cpu()
         return ((ours - theirs).norm() / theirs.norm()).item()
 
     def preprocess(self, images: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_constructskill.errors import InputError, MissingError
 
 from .backbone import IMAGE_SIZE, Backbone
-from .precision import PRECISIONS
+from .precision import PRECISIONS, RUNTIMES
 
 FEATURE_PREFIX = "observation.features."
 
@@ -84,8 +84,17 @@ def describe(
 
 def made_in(column: Mapping | None) -> str | None:
     """The precision of a feature column's encoder; None where there is no column or it does not say."""
-    found = ((column or {}).get("info") or {}).get("precision")
-    return found if found in PRECISIONS else None
+    return _said(column, "precision", PRECISIONS)
+
+
+def computed_by(column: Mapping | None) -> str | None:
+    """What computed a feature column; None where there is no column or it does not say."""
+    return _said(column, "runtime", RUNTIMES)
+
+
+def _said(column: Mapping | None, name: str, known: Sequence[str]) -> str | None:
+    found = ((column or {}).get("info") or {}).get(name)
+    return found if found in known else None
 
 
 def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> None:

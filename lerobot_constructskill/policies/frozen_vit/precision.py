@@ -10,6 +10,9 @@ from lerobot_constructskill.errors import InputError, MachineError
 
 PRECISIONS = ("float32", "bfloat16")
 
+RUNTIMES = ("openvino", "torch")
+"""What may compute a backbone's features: OpenVINO on a CPU, or PyTorch."""
+
 AUTO = "auto"
 """That of the feature set or checkpoint, where there is one, or else the fastest that the device does natively."""
 
