@@ -55,13 +55,13 @@ class FeatureTrainer:
         """Write out what `auto` means here, and which weights there are; None where there are none.
 
         Raises:
-            InputError: its heads are to begin as those of a checkpoint.
+            InputError: its heads are to begin as those of a checkpoint, or no source has weights of the hash it names.
         """
         if config.pretrained_path:
             raise InputError("A study trains frozen_vit's heads from the start; lerobot-train takes pretrained_path.")
         precision = resolve_precision(config.backbone_precision, config.device)
         spec = get_backbone(config.backbone, config.backbone_path)
-        sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
+        sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained, config.backbone_sha256)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
 
     def idle(self, config: FrozenViTChunkConfig) -> tuple[str, ...]:

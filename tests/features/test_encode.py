@@ -14,9 +14,11 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.artifacts.folders import MARK
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.features.points import POSES, find_points
+from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -330,3 +332,11 @@ def test_a_backbone_without_weights_is_told_that_the_features_are_anothers(encod
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
     with pytest.raises(ValueError, match=r"backbone vit_tiny16 \(the policy: clip_vitb16\)"):
         make_policy(FrozenViTChunkConfig(backbone="clip_vitb16", device="cpu"), ds_meta=encoded.meta)
+
+
+def test_a_study_takes_the_weights_whose_hash_it_names_or_none(weights):
+    settle = FeatureTrainer().settle
+    found = settle(policy_config(weights)).backbone_sha256
+    assert settle(policy_config(weights, backbone_sha256=found)).backbone_sha256 == found
+    with pytest.raises(InputError, match="weights asked for have sha256 000000000000, but local tiny.safetensors has"):
+        settle(policy_config(weights, backbone_sha256="0" * 64))

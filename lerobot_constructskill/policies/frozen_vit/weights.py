@@ -78,10 +78,12 @@ def load_weights(
 
 
 @cache
-def find_sha256(backbone: Backbone, path: str | None = None, pretrained: bool = True) -> str | None:
-    """Hash of the weights that `load_weights` takes; None where no source has any."""
+def find_sha256(
+    backbone: Backbone, path: str | None = None, pretrained: bool = True, sha256: str | None = None
+) -> str | None:
+    """Hash of the weights that `load_weights` takes; None where no source has any. It raises what that raises."""
     try:
-        return state_sha256(load_weights(backbone, path, pretrained=pretrained)[0])
+        return state_sha256(load_weights(backbone, path, sha256, pretrained)[0])
     except MissingWeightsError:
         return None
 
