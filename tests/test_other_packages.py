@@ -6,14 +6,16 @@ import re
 import subprocess
 import sys
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib import import_module, reload
 from pathlib import Path
 from typing import Any
 
 import pytest
-from commands import call
+from commands import BIN, call
 
 from lerobot_constructskill import contract, other_tasks
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
 
 GUIDE = Path(__file__).parents[1] / "docs" / "new_task.md"
@@ -54,10 +56,11 @@ def test_worker_processes_know_the_guides_task(installed, tmp_path):
 @pytest.mark.slow
 def test_the_guides_task_is_checked_and_recorded_without_a_checkout(installed, tmp_path):
     task, path = "--task=lintel_to_wall", {"PYTHONPATH": str(installed)}
-    checked = call("constructskill-check-task", task, "--states=1", "--tests=false", f"--folder={tmp_path}", **path)
+    quick = ["--states=1", "--tests=false", f"--folder={tmp_path}"]
+    checked = call(BIN / "constructskill-check-task", task, *quick, **path)
     assert "lintel_to_wall: the expert succeeds in 1 of 1 initial states" in checked
     size = ["--episodes=1", "--repo_id=local/lintel", f"--root={tmp_path / 'lintel'}"]
-    call("constructskill-generate", "smoke", task, *size, **path)
+    call(BIN / "constructskill-generate", "smoke", task, *size, **path)
     assert "lintel_to_wall" in (tmp_path / "lintel" / "README.md").read_text()
 
 
@@ -119,3 +122,24 @@ def test_a_package_that_cannot_be_loaded_is_left_out_with_one_sentence(install, 
         assert list(contract.TASKS) == [*contract.SHIPPED, "turn"]
     (said,) = caplog.messages
     assert said.startswith("The tasks of the package 'bad' are left out: ") and "\n" not in said
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("scene", "source", "said"),
+    [
+        (
+            "unfinished",
+            "import nothing_like_it",
+            r"cannot be imported \(ModuleNotFoundError: No module named ",
+        ),
+        ("unregistered", "", "does not register lay-v1 with ManiSkill: decorate its class"),
+    ],
+)
+def test_a_scene_that_is_none_stops_its_own_task_alone(scene, source, said, install, tmp_path, monkeypatch):
+    (tmp_path / f"{scene}.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    install(one=replace(row("lay"), scene=f"{scene}:Scene"))
+    reload(import_module("lerobot_constructskill.sim.register"))  # as every environment's first step does
+    with pytest.raises(InputError, match=f"^The scene of the task 'lay', {scene}:Scene, {said}"):
+        ConstructSkillEnv("lay", render_backend="none").reset()
