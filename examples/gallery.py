@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_constructskill.contract import DEMO_SEED_START, FPS, TASKS, Task
+from lerobot_constructskill.contract import DEMO_SEED_START, FPS, SHIPPED, Task
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -22,7 +22,7 @@ SIDE = 224
 
 
 def main(pictures: str = "examples/pictures", films: str = "docs/films") -> None:
-    for task in tqdm(TASKS.values()):
+    for task in tqdm(SHIPPED.values()):
         seen, close_ups = demonstration(task)
         tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])
         Image.fromarray(beside(*tiles)).save(Path(pictures) / f"{task.name}.jpg", quality=85)

@@ -6,9 +6,12 @@ as privileged state.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from math import pi
+from typing import Any
 
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.other_tasks import offered
 
 FPS = 20
 """Control rate in Hz: ManiSkill's default, and the frame rate of every data set."""
@@ -149,7 +152,7 @@ BRICK = (0.21, 0.065, 0.10)
 LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}
 """The tolerance ladder: task name to the total clearance in x and in y, in metres."""
 
-TASKS = {
+SHIPPED = {
     task.name: task
     for task in (
         Task(
@@ -229,6 +232,33 @@ TASKS = {
         ),
     )
 }
+"""The rows of this package, by name."""
+
+TASKS: dict[str, Task]
+"""All rows, by name: those of this package, then those that other installed packages offer."""
+
+
+@cache
+def _all_tasks() -> dict[str, Task]:
+    tasks = dict(SHIPPED)
+    owners = {key: "lerobot_constructskill" for task in SHIPPED.values() for key in (task.name, task.env_id)}
+    for package, task in offered(Task):
+        for key in (task.name, task.env_id):
+            if key in owners:
+                raise InputError(
+                    f"The packages '{owners[key]}' and '{package}' both have a task '{key}': uninstall one, or give "
+                    "its task another name and env_id."
+                )
+        tasks[task.name] = task
+        owners |= dict.fromkeys((task.name, task.env_id), package)
+    return tasks
+
+
+def __getattr__(name: str) -> Any:
+    # Other packages import this module for `Task`. So their rows are read on first use, when all imports are through.
+    if name == "TASKS":
+        return _all_tasks()
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def get_task(name: str) -> Task:
@@ -237,9 +267,10 @@ def get_task(name: str) -> Task:
     Raises:
         ValueError: there is no such task; the message lists those there are.
     """
-    if name not in TASKS:
-        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}.")
-    return TASKS[name]
+    tasks = _all_tasks()
+    if name not in tasks:
+        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}.")
+    return tasks[name]
 
 
 SUITES = {
@@ -265,9 +296,9 @@ def select_tasks(names: str) -> dict[str, list[Task]]:
     selected: dict[str, list[Task]] = {}
     for name in (part.strip() for part in names.split(",")):
         suite, members = (name, SUITES[name]) if name in SUITES else (LOOSE, (name,))
-        if suite == LOOSE and name not in TASKS:
-            suites = ", ".join(SUITES)
-            raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(TASKS)}; the suites: {suites}.")
+        if suite == LOOSE and name not in _all_tasks():
+            tasks, suites = ", ".join(_all_tasks()), ", ".join(SUITES)
+            raise InputError(f"Unknown task '{name}'; the tasks are: {tasks}; the suites: {suites}.")
         selected.setdefault(suite, []).extend(get_task(member) for member in members)
     rows = [row for suite in selected.values() for row in suite]
     if len(set(rows)) < len(rows):

@@ -12,7 +12,8 @@ from lerobot_constructskill.scripts.doctor_checks import Finding, Level, Probe
 
 REPOSITORY = Path(__file__).parents[1]
 REQUIREMENTS = ["lerobot[dataset]<0.7,>=0.6.1", "sapien<3.1,>=3.0.3; extra == 'sim'", "ruff; extra == 'dev'"]
-RENDERS = Probe(True, "cpu", "")
+RENDERS = Probe(True, "cpu\tFalse", "")
+OLD_DRIVER = Probe(True, "\tThe NVIDIA driver on your system is too old (found version 11040).", "")
 BROKEN = Probe(False, "", "RuntimeError: no such thing")
 
 
@@ -33,6 +34,9 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1"}), Level.WARN),
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.7.0", "sapien": "3.0.3"}), Level.FAIL),
         (checks.judge_versions(REQUIREMENTS, {"sapien": "3.0.3"}), Level.FAIL),
+        (checks.judge_lerobot("0.6.2"), Level.OK),
+        (checks.judge_lerobot("0.7.0"), Level.WARN),
+        (checks.judge_lerobot(None), Level.FAIL),
         (checks.judge_opencv({"opencv-python-headless": "4.12"}), Level.OK),
         (checks.judge_opencv(dict.fromkeys(checks.OPENCV, "4.12")), Level.WARN),
         (checks.judge_opencv({}), Level.FAIL),
@@ -43,8 +47,14 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
         (checks.judge_mesa(None, gpu=False), Level.WARN),
         (checks.judge_mesa("22.3.6", gpu=True), Level.OK),
         (checks.judge_vulkan(RENDERS, simulator=True), Level.OK),
+        (checks.judge_vulkan(RENDERS, simulator=True, gpu=True), Level.WARN),
+        (checks.judge_vulkan(Probe(True, "NVIDIA H100\tTrue", ""), simulator=True, gpu=True), Level.OK),
         (checks.judge_vulkan(BROKEN, simulator=True), Level.FAIL),
         (checks.judge_vulkan(BROKEN, simulator=False), Level.WARN),
+        (checks.judge_cuda(Probe(True, "NVIDIA H100", ""), gpu=True), Level.OK),
+        (checks.judge_cuda(Probe(True, "", ""), gpu=False), Level.OK),
+        (checks.judge_cuda(OLD_DRIVER, gpu=True), Level.WARN),
+        (checks.judge_cuda(BROKEN, gpu=False), Level.FAIL),
         (checks.judge_plugin(Probe(True, "said before\nTrue True", "")), Level.OK),
         (checks.judge_plugin(Probe(True, "True False", "")), Level.FAIL),
         (checks.judge_plugin(BROKEN), Level.FAIL),
@@ -75,8 +85,16 @@ def test_complaints_name_their_cause() -> None:
     versions = checks.judge_versions(REQUIREMENTS, {"lerobot": "0.5"}).message
     assert versions == "lerobot is 0.5 (needs <0.7,>=0.6.1); pip install 'lerobot[dataset]<0.7,>=0.6.1'."
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
+    assert "system is too old (found version 11040)); install" in checks.judge_cuda(OLD_DRIVER, gpu=True).message
+    assert "0.7.0 was not tried" in checks.judge_lerobot("0.7.0").message
     assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb\t", "")).message
+
+
+def test_the_pinned_lerobot_was_tried_and_so_says_the_page() -> None:
+    pins, page = ((REPOSITORY / name).read_text() for name in ("constraints.txt", "docs/lerobot.md"))
+    assert any(f"\nlerobot=={version}\n" in pins for version in checks.LEROBOTS)
+    assert all(f"| {version} |" in page for version in checks.LEROBOTS)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -190,3 +191,18 @@ def test_what_lerobot_parses_is_refused_by_no_value_error() -> None:
     with pytest.raises(FieldError, match="a sentence") as refusal, heard_by_lerobot():
         raise InputError("a sentence.")
     assert not isinstance(refusal.value, ValueError)
+
+
+def said(path: Path) -> Iterator[str]:
+    """The strings of a file but for its docstrings."""
+    nodes = list(ast.walk(ast.parse(path.read_text())))
+    docstrings = {node.value for node in nodes if isinstance(node, ast.Expr)}
+    strings = (node for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str))
+    yield from (node.value for node in strings if node not in docstrings)
+
+
+@pytest.mark.parametrize("room", ["policies", "features"])
+def test_what_our_commands_and_lerobots_share_names_fields_and_no_flags_of_one(room: str) -> None:
+    """`--policy.backbone_path` is `--backbone_path` for constructskill-encode, and a line of YAML for a study."""
+    texts = [text for path in MODULES if room in path.parts for text in said(path)]
+    assert texts and not [text for text in texts if "--policy." in text or "--dataset." in text]

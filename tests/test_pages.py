@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.contract import SHIPPED
 from lerobot_constructskill.perturbations import AXES
 
 ROOT = Path(__file__).parents[1]
@@ -42,8 +42,8 @@ def test_every_axis_has_its_row_with_its_levels(axis):
     assert [float(level) for level in levels if level] == [*AXES[axis].levels]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_its_row_picture_limits_and_film(task):
+@pytest.mark.parametrize("task", SHIPPED)
+def test_every_shipped_task_has_its_row_picture_limits_and_film(task):
     text, _, limits = (ROOT / "docs" / "tasks.md").read_text().partition("## Known limits")
     assert f"| `{task}` |" in text and f"| `{task}` |" in limits
     assert f"({Path('..') / 'examples' / 'pictures' / task}.jpg)" in text

@@ -20,9 +20,9 @@ from lerobot_constructskill.contract import (
     GRIPPER,
     IMAGE_SIZE,
     OBS_TYPES,
+    SHIPPED,
     STATE_NAMES,
     SUITES,
-    TASKS,
     Task,
 )
 from lerobot_constructskill.study.rows import VARIANT
@@ -37,13 +37,14 @@ def pages(root: Path) -> dict[str, str]:
     limits = known_limits((root / "docs" / "tasks.md").read_text())
     experts = json.loads((root / "benchmarks" / "experts.json").read_text())
     return {
-        f"docs/tasks/{name}.md": page(task, experts.get(name), outcomes, limits[name]) for name, task in TASKS.items()
+        f"docs/tasks/{name}.md": page(task, experts.get(name), outcomes, limits[name])
+        for name, task in SHIPPED.items()
     }
 
 
 def with_links(markdown: str) -> str:
     """The table of tasks, where each name leads to the task's page."""
-    names = "|".join(TASKS)
+    names = "|".join(SHIPPED)
     return re.sub(
         rf"^\| `({names})` \|", lambda row: f"| [`{row[1]}`](tasks/{row[1]}.md) |", markdown, flags=re.MULTILINE
     )

@@ -1,6 +1,5 @@
 """`--env.type=constructskill`."""
 
-import multiprocessing
 import os
 from dataclasses import dataclass
 from functools import partial
@@ -100,8 +99,6 @@ class ConstructSkillEnvConfig(EnvConfig):
             return NativeVectorEnv(n_envs, **kwargs)
         env_fns = [partial(ConstructSkillEnv, **kwargs) for _ in range(n_envs)]
         if use_async_envs and n_envs > 1:
-            # One import in the fork server in place of one in every worker; nothing here touches Vulkan or CUDA.
-            multiprocessing.set_forkserver_preload(["lerobot.envs.utils", "lerobot_constructskill.sim.register"])
             probe = self._make_env(task)
             env_fns = [partial(recording_into, os.environ.get(FOLDER), fn) for fn in env_fns]
             return LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)

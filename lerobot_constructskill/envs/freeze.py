@@ -5,11 +5,15 @@ from typing import Any
 
 import gymnasium as gym
 
+from lerobot_constructskill.envs.fork_server import start_fork_server
 from lerobot_constructskill.lerobot_internals import (
     NEW_ROLLOUT_OPTION,
     FreezeAfterEpisodeEnd,
     _LazyAsyncVectorEnv,
 )
+
+PRELOADED = ("lerobot.envs.utils", "lerobot_constructskill.sim.register")
+"""What every worker of LeRobot's vector environments imports."""
 
 
 class FrozenAtEnd(FreezeAfterEpisodeEnd):
@@ -24,7 +28,14 @@ class FrozenAtEnd(FreezeAfterEpisodeEnd):
 
 
 class LazyAsyncVectorEnv(_LazyAsyncVectorEnv):
-    """LeRobot's, whose workers freeze by themselves, thawed by every `reset` too."""
+    """LeRobot's, whose workers freeze by themselves, thawed by every `reset` too.
+
+    The workers are forked when they are first needed, from a server that has imported what they need.
+    """
+
+    def _ensure(self) -> None:
+        start_fork_server(PRELOADED)
+        super()._ensure()
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
         return super().reset(**thawing(**given))

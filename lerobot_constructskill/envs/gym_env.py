@@ -187,12 +187,21 @@ class ConstructSkillEnv(gym.Env):
     # ManiSkill
 
     def make_scene(self, num_envs: int = 1) -> gym.Env:
-        """The task's ManiSkill environment; several copies of it in one simulator need a GPU."""
+        """The task's ManiSkill environment; several copies of it in one simulator need a GPU.
+
+        Raises:
+            InputError: the task is another package's, whose scene cannot be imported.
+            OSError: the simulator is not installed, or there is no device to render with.
+        """
+        from lerobot_constructskill.sim.drivers import show_all_drivers
+
+        show_all_drivers()
         try:
-            import lerobot_constructskill.sim.register  # noqa: F401
+            from lerobot_constructskill.sim.register import register
         except ModuleNotFoundError as error:  # Gymnasium's worker processes drop the name of the package
             raise MachineError(remedy_of(error) or str(error)) from error
 
+        register(self._row)
         _spare_imports()
         return gym.make(
             self._row.env_id,
@@ -260,6 +269,9 @@ def _spare_imports() -> None:
 
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
     """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
+    from lerobot_constructskill.sim.drivers import show_all_drivers
+
+    show_all_drivers()
     try:
         from lerobot_constructskill.sim.rendering import best_render_backend
     except ModuleNotFoundError:

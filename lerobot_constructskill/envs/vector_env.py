@@ -1,7 +1,7 @@
 """Many environments in one natively vectorised simulator, as LeRobot wants a vector environment.
 
 With PhysX on a GPU one scene steps and renders hundreds of environments at once; PhysX on a CPU knows only one.
-Not yet run on a GPU: here one environment is tested against `ConstructSkillEnv`, which it has to equal.
+Several environments have not yet run on a GPU. One environment is tested on the CPU: it equals `ConstructSkillEnv`.
 """
 
 import os
@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_constructskill.envs.gym_env import UNBORN, ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
-from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.errors import InputError
 
 
 def check_unperturbed(perturb: str) -> None:
@@ -37,7 +37,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
 
     Raises:
         InputError: episodes are to be recorded or perturbed, which it cannot.
-        OSError: there is no GPU for more than one (on the first `reset`).
+        OSError: there is no GPU for more than one, or no PhysX for it (on the first `reset`).
     """
 
     def __init__(self, n_envs: int, **kwargs: Any):
@@ -72,7 +72,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         if len(seeds) != self.num_envs:
             raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
         if self._env is None:
-            self._env = self._make_scene()
+            self._env = self._single.make_scene(self.num_envs)
         # As in `ConstructSkillEnv`: PhysX would keep contacts.
         obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
         self._steps = 0
@@ -126,17 +126,6 @@ class NativeVectorEnv(gym.vector.VectorEnv):
     def _check_started(self) -> None:
         if self._env is None:
             raise RuntimeError(UNBORN)
-
-    def _make_scene(self) -> gym.Env:
-        try:
-            return self._single.make_scene(self.num_envs)
-        except RuntimeError as error:
-            if "cuda" not in str(error):
-                raise
-            raise MachineError(
-                f"{self.num_envs} environments in one simulator need a GPU, and there is none ({error}); use one, or "
-                "--env.vectorization=process."
-            ) from None
 
     def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
         cameras = self._single.cameras

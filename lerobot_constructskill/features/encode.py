@@ -30,6 +30,10 @@ PARTS = "encoded"
 
 PATCHES = ".patches.npy"
 
+BATCH, BATCHES = 16, {"cuda": 256}
+"""Images that are encoded at a time by default, and by kinds of devices on which more are faster. On those the last
+bits of a feature depend on the batch, so the description of the features names its size."""
+
 
 def load_encoder(
     backbone: str,
@@ -58,6 +62,12 @@ def load_encoder(
     return encoder, {**describe(spec, state_sha256(state), precision, crop, blind), **made}
 
 
+def batch_facts(device: torch.device | str, batch_size: int | None = None) -> dict[str, str]:
+    """What the description of features says of their batch: its size, on a device of `BATCHES`."""
+    kind = torch.device(device).type
+    return {"batch_size": str(batch_size or BATCHES[kind])} if kind in BATCHES else {}
+
+
 def write_feature_set(
     dataset: LeRobotDataset,
     camera: str,
@@ -65,7 +75,7 @@ def write_feature_set(
     info: dict[str, str],
     repo_id: str,
     folder: Path,
-    batch_size: int = 16,
+    batch_size: int | None = None,
     patches: bool = False,
     points: bool = False,
 ) -> None:
@@ -77,13 +87,15 @@ def write_feature_set(
     Args:
         encoder: what encodes, and with `info` its description, as `load_encoder` returns them.
         folder: where to, a path that `staged` gave; episodes that a killed run finished are not encoded again.
+        batch_size: images at a time; that of the encoder's device by default.
         patches: whether to write every patch's feature as well, to `PATCHES_FILE`.
         points: whether to write as well where in the image the points of `readouts.POINTS` are.
 
     Raises:
         ValueError: the data set has no such camera, or does not say where things are.
     """
-    info = _with_source(info, dataset)
+    batch_size = batch_size or BATCHES.get(encoder.device.type, BATCH)
+    info = _with_source(info, dataset) | batch_facts(encoder.device, batch_size)
     made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
     found = _find_points(dataset, camera, encoder.crop) if points else {}

@@ -18,7 +18,13 @@ from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import InputError, MissingWeightsError
-from lerobot_constructskill.features.encode import PARTS, join_feature_sets, load_encoder, write_feature_set
+from lerobot_constructskill.features.encode import (
+    PARTS,
+    batch_facts,
+    join_feature_sets,
+    load_encoder,
+    write_feature_set,
+)
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.features import close_patches, describe, feature_key
@@ -49,17 +55,18 @@ class FeatureTrainer:
         """Write out what `auto` means here, and which weights there are; None where there are none.
 
         Raises:
-            InputError: its heads are to begin as those of a checkpoint.
+            InputError: its heads are to begin as those of a checkpoint, or no source has weights of the hash it names.
         """
         if config.pretrained_path:
             raise InputError("A study trains frozen_vit's heads from the start; lerobot-train takes pretrained_path.")
         precision = resolve_precision(config.backbone_precision, config.device)
         spec = get_backbone(config.backbone, config.backbone_path)
-        sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained)
+        sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained, config.backbone_sha256)
         return replace(config, backbone_precision=precision, backbone_sha256=sha256, save_backbone=False)
 
     def idle(self, config: FrozenViTChunkConfig) -> tuple[str, ...]:
-        return () if READOUTS[config.readout].points else ("point_weight",)
+        written = ("backbone_trained_runtime",)
+        return written if READOUTS[config.readout].points else (*written, "point_weight")
 
     def settled_elsewhere(self, config: FrozenViTChunkConfig) -> list[dict[str, Any]]:
         """The precisions that `auto` means on other machines."""
@@ -216,6 +223,7 @@ def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDatas
         load_weights(spec, config.backbone_path)  # says what was tried
         raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
+    made_by |= batch_facts(config.device)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
     made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
     beside = {"patches": readout.reads_patches} | ({"points": [*readout.points]} if readout.points else {})

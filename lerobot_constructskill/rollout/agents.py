@@ -130,7 +130,8 @@ class Lockstep:
     """Many agents of which each acts once a step; what several policies of a class compute alike is computed once.
 
     A policy class takes part by an attribute `in_lockstep`: called with its policies by number it returns a function,
-    which is called with their preprocessed batches by number and returns batches that `select_action` takes as well.
+    which is called with their preprocessed batches by number. It returns batches that `select_action` takes as well,
+    or an exception in place of a batch.
     """
 
     def __init__(self, agents: Sequence[Agent]):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.artifacts.pools import cores, die_with_parent
+from lerobot_constructskill.envs.fork_server import start_fork_server
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError, full_traceback
 
@@ -21,8 +22,7 @@ PRELOADED = [
     "lerobot_constructskill.sim.register",
     "lerobot_constructskill.rollout.simulators",
 ]
-"""Imported once, by the server that workers are forked from; nothing in it touches Vulkan or CUDA."""
-
+"""What every worker imports."""
 
 DIED = "A simulator's process died; if there was not enough memory, run fewer at once."
 
@@ -81,7 +81,7 @@ class Simulators:
 def simulators(env_kwargs: Sequence[Mapping[str, Any]], n_workers: int | None = None) -> Iterator[Simulators]:
     """Open a `ConstructSkillEnv(**kwargs)` for each of `env_kwargs` in `n_workers` processes (one per core)."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(PRELOADED)
+    start_fork_server(PRELOADED)
     n_workers = min(len(env_kwargs), n_workers or cores())
     processes, connections = [], []
     try:

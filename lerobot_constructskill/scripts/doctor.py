@@ -16,9 +16,11 @@ from lerobot_constructskill.scripts.doctor_checks import (
     Level,
     Probe,
     judge_bytecode,
+    judge_cuda,
     judge_encoder,
     judge_fetched,
     judge_ffmpeg,
+    judge_lerobot,
     judge_mesa,
     judge_name,
     judge_opencv,
@@ -33,6 +35,8 @@ PROBE_TIMEOUT_S = 600  # importing LeRobot took 3 minutes on one core of a busy 
 
 # The choice of `best_render_backend`, without ManiSkill.
 RENDER = """
+from lerobot_constructskill.sim.drivers import show_all_drivers
+show_all_drivers()
 import sapien
 try:
     device = sapien.Device("cuda")
@@ -41,7 +45,16 @@ except RuntimeError:
 if device is None or not device.can_render():
     device = sapien.Device("cpu")
 sapien.render.RenderSystem(device)
-print(device.name)
+print(device.name, device.is_cuda(), sep="\\t")
+"""
+
+# torch says by a warning why it cannot use a GPU, such as a driver that is older than its CUDA.
+CUDA = """
+import warnings, torch
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    name = torch.cuda.get_device_name() if torch.cuda.is_available() else ""
+print(name, *(" ".join(str(one.message).split()) for one in said[:1]), sep="\\t")
 """
 
 REGISTER = """
@@ -143,7 +156,7 @@ def check_versions() -> Finding:
 def check_vulkan() -> Finding:
     if "sapien" not in installed_versions():
         return judge_vulkan(Probe(False, "", ""), simulator=False)
-    return judge_vulkan(probe(RENDER), simulator=True)
+    return judge_vulkan(probe(RENDER), simulator=True, gpu=has_gpu())
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
@@ -151,9 +164,11 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
     check_bytecode,
     lambda: judge_name(list(installed_versions())),
     check_versions,
+    lambda: judge_lerobot(installed_versions().get("lerobot")),
     lambda: judge_opencv(installed_versions()),
     lambda: judge_mesa(mesa_version(), has_gpu()),
     check_vulkan,
+    lambda: judge_cuda(probe(CUDA), has_gpu()),
     lambda: judge_ffmpeg(probe(DECODE)),
     lambda: judge_plugin(probe(REGISTER)),
     lambda: judge_weights(probe(FIND_WEIGHTS)),

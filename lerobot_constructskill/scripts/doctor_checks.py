@@ -12,10 +12,14 @@ PYTHONS = ((3, 12), (3, 13))
 MESA_MINIMUM = (24, 3)
 """The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
 
+LEROBOTS = ("0.6.1", "0.6.2")
+"""Those on which this version was tried (docs/lerobot.md)."""
+
 DEMO_FRAMES = 5_381
 """What `constructskill-generate fast_shifted_wrist --episodes=50` makes."""
 
 REINSTALL = f"pip install --force-reinstall --no-deps '{DISTRIBUTION}', or the checkout's folder in its place"
+DRIVER = "install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all)"
 RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1 (Debian 12: from its backports; Ubuntu: 24.04 or newer)"
 
 OPENCV = (
@@ -115,6 +119,16 @@ def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) ->
     return Finding(Level.OK, "Versions", ", ".join(right))
 
 
+def judge_lerobot(version: str | None) -> Finding:
+    if version in LEROBOTS:
+        return Finding(Level.OK, "LeRobot", f"{version}, on which this package was tried")
+    tried, remedy = " and ".join(LEROBOTS), f"pip install lerobot=={LEROBOTS[0]}"
+    if version is None:
+        return Finding(Level.FAIL, "LeRobot", f"it is not installed; {remedy}.")
+    said = f"{version} was not tried with this package, {tried} were; if something fails, {remedy}."
+    return Finding(Level.WARN, "LeRobot", said)
+
+
 def judge_opencv(installed: Mapping[str, str]) -> Finding:
     """Compare the distributions with LeRobot's choice of one; ManiSkill's requirements bring a second."""
     found = sorted(set(OPENCV) & set(installed))
@@ -148,7 +162,13 @@ def judge_mesa(version: str | None, gpu: bool) -> Finding:
     return Finding(Level.OK, "Mesa", str(version))
 
 
-def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
+def judge_vulkan(probe: Probe, simulator: bool, gpu: bool = False) -> Finding:
+    """Judge a line of the device that renders and whether it is a GPU.
+
+    Args:
+        simulator: whether SAPIEN is installed.
+        gpu: whether this machine has an NVIDIA GPU.
+    """
     if not simulator:
         return Finding(
             Level.WARN, "Vulkan", f"not tried, because sapien is not installed; pip install '{DISTRIBUTION}[sim]'."
@@ -157,10 +177,29 @@ def judge_vulkan(probe: Probe, simulator: bool) -> Finding:
         return Finding(
             Level.FAIL,
             "Vulkan",
-            f"SAPIEN finds no device to render with ({probe.reason}); {RENDERER}, or on an NVIDIA machine "
-            "install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all).",
+            f"SAPIEN finds no device to render with ({probe.reason}); {RENDERER}, or on an NVIDIA machine {DRIVER}.",
         )
-    return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{probe.answer}'")
+    device, _, is_gpu = probe.answer.partition("\t")
+    if gpu and is_gpu == "False":
+        return Finding(Level.WARN, "Vulkan", f"SAPIEN renders on '{device}' and not on the GPU; {DRIVER}.")
+    return Finding(Level.OK, "Vulkan", f"SAPIEN renders on '{device}'")
+
+
+def judge_cuda(probe: Probe, gpu: bool) -> Finding:
+    """Judge a line of the GPU that torch found, empty where it found none, and why it found none."""
+    if not probe.ok:
+        return Finding(Level.FAIL, "CUDA", f"torch does not run ({probe.reason}); fix what fails above first.")
+    device, _, reason = probe.answer.partition("\t")
+    if device:
+        return Finding(Level.OK, "CUDA", f"torch computes on '{device}'")
+    if not gpu:
+        return Finding(Level.OK, "CUDA", "no NVIDIA GPU: torch computes on the CPU")
+    because = f" ({reason.rstrip('.')})" if reason else ""
+    return Finding(
+        Level.WARN,
+        "CUDA",
+        f"torch does not find the GPU{because}; install a newer driver, or a torch for the CUDA of this driver.",
+    )
 
 
 def judge_plugin(probe: Probe) -> Finding:

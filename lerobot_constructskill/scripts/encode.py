@@ -29,7 +29,7 @@ class EncodeConfig:
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
     points: bool = False  # also write where in the image object, receptacle and hand are, for the readout heat_maps
-    batch_size: BatchSize = 16  # images at a time
+    batch_size: BatchSize | None = None  # images at a time; default: 16, on a GPU 256
     device: Device | None = None  # default: a GPU if there is one
 
     def __post_init__(self):

@@ -31,6 +31,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import looking_from, seen_from
@@ -94,7 +95,7 @@ class PickPlaceEnv(BaseEnv):
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
-        OSError: there is no Vulkan device to render with.
+        OSError: there is no Vulkan device to render with, or no GPU for several environments in one simulator.
         ValueError: another brick size is asked of a task without a brick.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
@@ -146,6 +147,8 @@ class PickPlaceEnv(BaseEnv):
                 "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
                 "`constructskill-doctor` says what is missing."
             )
+        if steps_on_gpu(kwargs.get("sim_backend", "auto"), num_envs := kwargs.get("num_envs", 1)):
+            enable_gpu_physics(num_envs, render_backend)
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot

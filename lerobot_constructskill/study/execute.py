@@ -14,6 +14,7 @@ from itertools import groupby
 from pathlib import Path
 
 import httpx
+import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
@@ -223,8 +224,21 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         weights_sha256=weights,
         environment_sha256=digest({"environment": arm.env, "backend": backend}),
         backend=backend,
-        versions=json.dumps(run.versions | made_of | {"processor": processor()}),
+        versions=json.dumps(run.versions | made_of | _made_on(getattr(arm.policy, "device", None), backend)),
     )
+
+
+def _made_on(device: str | None, backend: str | None) -> dict[str, str]:
+    """The processor that made a row, and the graphics card where the policy or the renderer used one.
+
+    Args:
+        device: torch's name of the one that the policy acts on.
+        backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
+    """
+    acts = (device or "").startswith("cuda")
+    if not acts and "cuda" not in (backend or ""):
+        return {"processor": processor()}
+    return {"processor": processor(), "card": torch.cuda.get_device_name(device if acts else None)}
 
 
 def _dataset_sha256(job: Job, run: Run) -> str | None:

@@ -59,7 +59,8 @@ class EpisodeRow:
         weights_sha256: hash of the policy's weights.
         environment_sha256: hash of the environment's configuration.
         backend: what rendered and simulated, such as "physx_cpu, cpu rendering".
-        versions: JSON, package to version, and what processor made the row.
+        versions: JSON, package to version, and the processor (and the graphics card, if one was used) that made
+            the row.
     """
 
     run: str | None

@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import forkserver, get_context
 
 import numpy as np
 import pytest
@@ -254,9 +254,21 @@ def test_translations_are_clipped_not_rescaled(env):
     np.testing.assert_array_equal(reach(ACTION_SCALE), reach(3 * ACTION_SCALE))
 
 
+@pytest.fixture
+def fresh_fork_server(monkeypatch):
+    """A fork server that is yet to start, on a machine where asking NVML for GPUs works without one."""
+    if not torch.cuda.is_available():
+        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    forkserver._forkserver._stop()
+
+
+def cannot_use_cuda() -> bool:
+    return torch.cuda._is_in_bad_fork()
+
+
 @pytest.mark.sim
 @pytest.mark.parametrize("use_async_envs", [False, True])
-def test_vector_environments_follow_lerobots_contract(use_async_envs):
+def test_vector_environments_follow_lerobots_contract(use_async_envs, fresh_fork_server):
     config = ConstructSkillEnvConfig(obs_type="pixels_agent_pos", episode_length=3)
     vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
     try:
@@ -280,6 +292,9 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs):
             assert (reward == 0).all()
         again, _ = vector.reset(seed=[7, 8])
         np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
+        if use_async_envs:  # a worker that inherits CUDA can use neither it nor Vulkan on a GPU
+            with ProcessPoolExecutor(1, get_context("forkserver")) as pool:
+                assert not pool.submit(cannot_use_cuda).result()
     finally:
         vector.close()
 

@@ -14,9 +14,11 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.artifacts.folders import MARK
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.features.points import POSES, find_points
+from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -110,6 +112,16 @@ def policy_config(weights: Path, **fields: object) -> FrozenViTChunkConfig:
     return FrozenViTChunkConfig(device="cpu", **fields)
 
 
+def test_a_device_on_which_the_batch_shows_has_its_own_and_says_so(source, weights, tmp_path, monkeypatch):
+    """As a GPU does; on a CPU a set says nothing of it."""
+    sizes, encode_batch = set(), features_encode._encode
+    monkeypatch.setattr(features_encode, "_encode", lambda *given: sizes.add(len(given[1])) or encode_batch(*given))
+    monkeypatch.setattr(features_encode, "BATCHES", {"cpu": 3})
+    encode(settings(source, weights, tmp_path / "out", batch_size=None))
+    info = LeRobotDataset("local/out", root=tmp_path / "out").meta.features[KEY]["info"]
+    assert max(sizes) == 3 and info.items() >= features_encode.batch_facts("cpu").items() == {("batch_size", "3")}
+
+
 @STORED
 def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encoded):
     assert {name for name in encoded.meta.features if "." in name} == {"observation.state", KEY}
@@ -125,6 +137,7 @@ def test_what_policies_read_is_as_before_and_nothing_else_is_there(source, encod
                 else before[name] == after[name]
             )
     assert encoded.meta.stats[KEY]["mean"].shape == (192,)
+    assert "batch_size" not in encoded.meta.features[KEY]["info"]
 
 
 @STORED
@@ -319,3 +332,11 @@ def test_a_backbone_without_weights_is_told_that_the_features_are_anothers(encod
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
     with pytest.raises(ValueError, match=r"backbone vit_tiny16 \(the policy: clip_vitb16\)"):
         make_policy(FrozenViTChunkConfig(backbone="clip_vitb16", device="cpu"), ds_meta=encoded.meta)
+
+
+def test_a_study_takes_the_weights_whose_hash_it_names_or_none(weights):
+    settle = FeatureTrainer().settle
+    found = settle(policy_config(weights)).backbone_sha256
+    assert settle(policy_config(weights, backbone_sha256=found)).backbone_sha256 == found
+    with pytest.raises(InputError, match="weights asked for have sha256 000000000000, but local tiny.safetensors has"):
+        settle(policy_config(weights, backbone_sha256="0" * 64))

@@ -277,5 +277,5 @@ def test_the_weight_of_the_points_is_the_configured_one(make_policy, make_batch)
 
 def test_a_state_that_is_not_shown_is_a_sentence(make_policy, images):
     policy = make_policy(use_state=True).eval()
-    with pytest.raises(InputError, match="was trained with observation.state, which --env.obs_type=pixels_agent_pos"):
+    with pytest.raises(InputError, match="was trained with observation.state, which obs_type=pixels_agent_pos"):
         policy.select_action({"observation.images.base": images})

@@ -10,6 +10,7 @@ import torch
 
 from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.policies.frozen_vit import openvino
 from lerobot_constructskill.policies.frozen_vit import precision as precision_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
@@ -48,7 +49,7 @@ def test_bfloat16_by_name_is_refused_where_it_would_be_emulated(machine, make_po
         lambda: make_policy(backbone_precision="bfloat16"),
         lambda: load_encoder("vit_tiny16", str(weights("vit_tiny16")), "bfloat16"),
     ):
-        with pytest.raises(ValueError, match="60 times slower .* --policy.backbone_precision=float32") as refusal:
+        with pytest.raises(ValueError, match="60 times slower .* use backbone_precision=float32") as refusal:
             call()
         assert "\n" not in str(refusal.value)
         assert isinstance(refusal.value, MachineError), "a study stops there; it is no result of a run"
@@ -84,6 +85,7 @@ def test_what_is_trained_further_on_images_is_of_the_precision_it_saw(machine, m
     policy = make_policy(backbone_precision="float32", backbone_trained_precision="bfloat16")
     assert policy.eval().config.backbone_trained_precision == "bfloat16"
     assert policy.train().config.backbone_trained_precision == "float32"
+    assert policy.config.backbone_trained_runtime == policy.backbone.runtime
 
 
 @pytest.mark.slow
@@ -105,4 +107,47 @@ def test_under_the_other_kinds_instructions_float32_is_close_to_ours(weights, im
 
 def test_a_blind_encoder_drifts_as_far_as_its_features_of_grey(images):
     encoder = FrozenEncoder(BACKBONES["vit_tiny16"], "float32", blind=True)
-    assert encoder.drift(images, "float32") < 1e-3
+    assert encoder.drift(images, "float32") < 1e-3 and encoder.drift(images, "float32", on_cpu=True) < 1e-3
+
+
+def test_features_of_a_cpu_are_told_apart_from_those_of_a_gpu(make_policy, images, monkeypatch, caplog):
+    policy = make_policy(backbone_precision="float32", backbone_trained_runtime="openvino")
+    policy._log_crossing(images)
+    assert not caplog.text
+    monkeypatch.setattr(FrozenEncoder, "device", torch.device("cuda"))
+    monkeypatch.setattr(FrozenEncoder, "drift", lambda self, images, precision, on_cpu: 0.005 * on_cpu)
+    policy._log_crossing(images)
+    assert "trained on features of a CPU in float32, acts on features of cuda in float32; on its" in caplog.text
+    assert "differ by 0.5 % of" in caplog.text
+
+
+@pytest.fixture
+def with_tf32():
+    """TF32 switched on, as LeRobot's commands do."""
+    torch.backends.cuda.matmul.allow_tf32 = True
+    yield
+    torch.backends.cuda.matmul.allow_tf32 = False
+
+
+def tf32() -> tuple[bool, bool]:
+    return torch.backends.cuda.matmul.allow_tf32, torch.backends.cudnn.allow_tf32
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("with_tf32")
+@pytest.mark.parametrize("precision", sorted({"float32", native_precision("cpu")}))
+@pytest.mark.parametrize("runtime", ["openvino", "torch"])
+def test_autocast_and_tf32_around_an_encoder_change_no_feature(precision, runtime, images, monkeypatch):
+    """As in `lerobot-eval --policy.use_amp=true`, where the first image meets an encoder that is not yet compiled."""
+    if runtime == "openvino":
+        pytest.importorskip("openvino", reason="the extra `cpu` supplies it")
+    monkeypatch.setattr(openvino, "is_installed", lambda: runtime == "openvino")
+    encoder, flags = FrozenEncoder(BACKBONES["vit_tiny16"], precision), []
+    inside = encoder.model.blocks[0].register_forward_hook(lambda *_: flags.append(tf32()))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        under_autocast = encoder.encode(images)
+    assert encoder.runtime == runtime and tf32() == (True, True) and flags[0] == (False, False)
+    inside.remove()
+    encoder._forget_compiled()
+    for ours, alone in zip(under_autocast, encoder.encode(images), strict=True):
+        assert torch.equal(ours, alone)

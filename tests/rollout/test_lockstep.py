@@ -110,14 +110,19 @@ def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on(conf
 
 def test_an_encoder_that_fails_takes_those_with_it_that_share_it_and_no_other(config, monkeypatch):
     agents = [random_agent(config, seed) for seed in range(2)]
+    pool = FrozenViTChunkPolicy.pool
 
-    def out_of_memory(*_):
-        raise MemoryError("no room for the batch")
+    def out_of_memory(policy, images):
+        if policy.config.crop is None:
+            raise MemoryError("no room for the batch")
+        return pool(policy, images)
 
     monkeypatch.setattr(FrozenViTChunkPolicy, "pool", out_of_memory)
     hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
-    *failed, fine = (rollout for _, rollout in sorted(roll_out([*agents, hover], ENV, SEEDS, n_workers=2)))
-    assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2 and fine.error is None
+    others = [random_agent(config, 2, crop=[0.25, 0.25, 0.75, 0.75]), hover]
+    *failed, other, still = (run for _, run in sorted(roll_out([*agents, *others], ENV, SEEDS, n_workers=2)))
+    assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2
+    assert other.error is None and still.error is None
 
 
 class Looking(Broken):

@@ -1,6 +1,10 @@
 """What every registered task owes, checked on the real simulator and renderer."""
 
+import json
+import subprocess
+import sys
 from importlib import import_module
+from zipfile import BadZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -12,9 +16,11 @@ from mani_skill.utils.structs import Pose
 
 import lerobot_constructskill.sim.register  # noqa: F401
 from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim import gpu_physics, scene
 from lerobot_constructskill.sim.hold import Hold
+from lerobot_constructskill.sim.rendering import best_render_backend
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
 from lerobot_constructskill.sim.tasks.block import BlockToBinEnv
 from lerobot_constructskill.sim.tasks.brick_on_brick import TOLERANCE
@@ -102,13 +108,50 @@ def test_the_object_is_set_down_where_and_as_turned_as_was_drawn():
         assert (x, y) == (0, 0) and np.isclose(np.arctan2(z, w) * 2, dyaw, atol=1e-5)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="several environments in one need a GPU")
-def test_an_episode_is_the_same_alone_and_in_a_batch_on_the_gpu():
-    batch = make("block_to_bin", num_envs=3, sim_backend="physx_cuda")
-    batch.reset(seed=[3, 4, 5])
+BATCH = """
+import json
+import gymnasium as gym
+import lerobot_constructskill.sim.register
+from lerobot_constructskill.contract import TASKS
+env = gym.make(TASKS["block_to_bin"].env_id, obs_mode="none", render_backend="none", num_envs=3).unwrapped
+env.reset(seed=[3, 4, 5])
+print(json.dumps(env.object.pose.p[1].tolist()))
+"""
+
+
+def test_an_episode_starts_alike_alone_and_in_a_batch_on_the_gpu():
+    """In a process of its own: PhysX can only be had on a GPU before any scene on the CPU."""
+    if best_render_backend() != "gpu":
+        pytest.skip("several environments in one simulator need a GPU")
+    done = subprocess.run([sys.executable, "-c", BATCH], capture_output=True, text=True)
+    if "library cannot be loaded" in done.stderr:
+        pytest.skip("PhysX for the GPU cannot be had here")
+    assert done.returncode == 0, done.stderr
     alone = make("block_to_bin")
     alone.reset(seed=4)
-    torch.testing.assert_close(batch.object.pose.p[1].cpu(), alone.object.pose.p[0])
+    np.testing.assert_allclose(json.loads(done.stdout.splitlines()[-1]), alone.object.pose.p[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("render_backend", "error", "said"),
+    [
+        ("gpu", ConnectionError("no route"), r"library cannot be loaded \(no route\)"),
+        ("gpu", OSError("libcuda.so: cannot open"), r"library cannot be loaded \(libcuda.so"),
+        ("none", BadZipFile("File is not a zip file"), r"library cannot be loaded \(File is not"),
+        ("none", RuntimeError("GPU PhysX can only be enabled once"), "must be the first scene of a process"),
+        ("cpu", None, "where the CPU cannot render: use render_backend=gpu or none"),
+    ],
+)
+def test_gpu_physics_that_cannot_be_had_is_refused_in_one_sentence(render_backend, error, said, monkeypatch):
+    def enable_gpu():
+        raise error
+
+    monkeypatch.setattr(gpu_physics.sapien, "Device", lambda name: name)
+    monkeypatch.setattr(gpu_physics.physx, "enable_gpu", enable_gpu)
+    monkeypatch.setattr(scene, "best_render_backend", lambda: "gpu")
+    with pytest.raises(UserError, match=f"^2 environments in one .* need physics on a GPU.* {said}") as told:
+        make("block_to_bin", num_envs=2, render_backend=render_backend)
+    assert "\n" not in str(told.value)
 
 
 def test_an_episodes_draw_does_not_depend_on_its_batch():

@@ -13,6 +13,7 @@ import torch
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError, MachineError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
@@ -642,3 +643,17 @@ def test_what_the_machine_lacks_is_no_result_of_a_run(error, is_the_machines):
             _let_through(error)
     else:
         _let_through(error)
+
+
+@pytest.mark.parametrize(
+    ("device", "backend", "card"),
+    [
+        ("cpu", "physx_cpu, sapien_cpu rendering", None),
+        (None, None, None),
+        ("cuda:1", "physx_cpu, sapien_cpu rendering", "card cuda:1"),
+        ("cpu", "physx_cpu, sapien_cuda rendering", "card None"),
+    ],
+)
+def test_a_row_names_the_graphics_card_where_it_used_one(device, backend, card, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda which: f"card {which}")
+    assert execute._made_on(device, backend) == {"processor": processor()} | ({"card": card} if card else {})

@@ -15,7 +15,7 @@ from .backbone import IMAGE_SIZE
 from .backbones import check_backbone
 from .features import feature_key, point_key
 from .heads import REGRESSION_LOSSES
-from .precision import AUTO, PRECISIONS
+from .precision import AUTO, PRECISIONS, RUNTIMES
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
@@ -60,6 +60,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             feature set, or without one the fastest that the device has natively.
         backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. If
             `backbone_precision` is another one, the log says so, with the drift of the features.
+        backbone_trained_runtime: written by the policy: what computed these features, "openvino" (a CPU) or "torch".
+            If it was OpenVINO and the policy acts on another device than a CPU, the log says so in the same way.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source of weights.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
@@ -124,6 +126,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_sha256: str | None = None
     backbone_precision: Annotated[str, Among((AUTO, *PRECISIONS))] = AUTO
     backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
+    backbone_trained_runtime: Annotated[str, Among(RUNTIMES)] | None = None
     save_backbone: bool = True
     camera: Word = "base"
     crop: list[Edge] | None = None
@@ -226,7 +229,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if fps != self.fps:
             raise InputError(
                 f"The data set has {fps} frames a second and the policy acts at {self.fps} Hz: train on a set of that "
-                "rate, or say --policy.fps if what it is for runs at another."
+                "rate, or set fps if what it is for runs at another."
             )
 
     def validate_features(self) -> None:
@@ -242,7 +245,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if self.image_key not in inputs and self.feature_key not in inputs:
             raise InputError(
                 f"frozen_vit needs {self.image_key} or {self.feature_key}; the inputs are: "
-                f"{', '.join(inputs) or 'none'} (choose another camera with --policy.camera)."
+                f"{', '.join(inputs) or 'none'} (choose another camera)."
             )
         if self.use_state and OBS_STATE not in inputs:
             raise InputError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")

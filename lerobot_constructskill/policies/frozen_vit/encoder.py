@@ -1,6 +1,7 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 
 from . import openvino
 from .backbone import IMAGE_SIZE, Backbone
-from .precision import is_native
+from .precision import computing_in, is_native
 
 GREY = 0.5
 """What a blind encoder sees, in every pixel."""
@@ -24,7 +25,8 @@ class FrozenEncoder(nn.Module):
     Args:
         backbone: the registry entry to build, with random weights until a state dict is loaded into `model`.
         precision: one of `precision.PRECISIONS` (features are float32 in either). OpenVINO computes it on a CPU
-            that does it natively, where OpenVINO is installed; elsewhere PyTorch, bfloat16 by autocast.
+            that does it natively, where OpenVINO is installed; elsewhere PyTorch, bfloat16 by autocast. Autocast and
+            TF32 that surround a call change nothing.
         crop: the part of every image that is encoded; None takes it all. The patches of a part are finer.
         blind: whether it sees a grey image in place of every other.
     """
@@ -79,28 +81,38 @@ class FrozenEncoder(nn.Module):
         return tuple(tokens.to(images.device).expand(len(images), *tokens.shape[1:]) for tokens in self._of_grey)
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = self.preprocess(images)
-        if self._is_compiled_for(pixels.device):
+        if self._is_compiled_for(self.device):
+            return self._encode_compiled(images)
+        return self._encode_eagerly(images, self.precision)
+
+    def _encode_compiled(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        with computing_in("float32", self.device):  # OpenVINO cannot convert the casts of autocast
             if self._compiled is None:
                 self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
-            return self._compiled(pixels)
-        return self._encode_eagerly(pixels, self.precision)
+            return self._compiled(self.preprocess(images))
 
     @torch.no_grad()
-    def _encode_eagerly(self, pixels: Tensor, precision: str) -> tuple[Tensor, Tensor]:
-        with torch.autocast(pixels.device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16"):
+    def _encode_eagerly(self, images: Tensor, precision: str) -> tuple[Tensor, Tensor]:
+        with computing_in("float32", self.device):
+            pixels = self.preprocess(images)
+        with computing_in(precision, self.device):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()
 
-    def drift(self, images: Tensor, precision: str) -> float:
-        """How far the patch features of images are from those in another precision, in shares of their norm.
+    def drift(self, images: Tensor, precision: str, on_cpu: bool = False) -> float:
+        """How far the patch features of images are from others, in shares of the others' norm.
 
-        PyTorch computes the other ones, also where they have to be emulated.
+        PyTorch computes the others, also where it has to emulate their precision.
+
+        Args:
+            precision: that of the others.
+            on_cpu: whether a CPU computes the others, instead of this encoder's own device.
         """
         if self.blind:
             images = torch.full_like(images[:1].float(), GREY)
-        ours = self.encode(images)[1]
-        theirs = self._encode_eagerly(self.preprocess(images), precision)[1]
+        ours = self.encode(images)[1].cpu()
+        other = deepcopy(self).cpu() if on_cpu else self
+        theirs = other._encode_eagerly(images.to(other.device), precision)[1].cpu()
         return ((ours - theirs).norm() / theirs.norm()).item()
 
     def preprocess(self, images: Tensor) -> Tensor:

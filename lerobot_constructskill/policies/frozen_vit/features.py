@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_constructskill.errors import InputError, MissingError
 
 from .backbone import IMAGE_SIZE, Backbone
-from .precision import PRECISIONS
+from .precision import PRECISIONS, RUNTIMES
 
 FEATURE_PREFIX = "observation.features."
 
@@ -44,7 +44,7 @@ def open_patches(root: Path) -> Tensor:
     if not file.exists():
         raise MissingError(
             f"The feature set in {root} has no {PATCHES_FILE}, which this readout needs: encode the data set with "
-            "constructskill-encode --patches=true, or, if it is from the Hub, download it whole (--dataset.root)."
+            "constructskill-encode --patches=true, or, if it is from the Hub, download it whole and give its folder."
         )
     return _mapped(file)
 
@@ -84,8 +84,17 @@ def describe(
 
 def made_in(column: Mapping | None) -> str | None:
     """The precision of a feature column's encoder; None where there is no column or it does not say."""
-    found = ((column or {}).get("info") or {}).get("precision")
-    return found if found in PRECISIONS else None
+    return _said(column, "precision", PRECISIONS)
+
+
+def computed_by(column: Mapping | None) -> str | None:
+    """What computed a feature column; None where there is no column or it does not say."""
+    return _said(column, "runtime", RUNTIMES)
+
+
+def _said(column: Mapping | None, name: str, known: Sequence[str]) -> str | None:
+    found = ((column or {}).get("info") or {}).get(name)
+    return found if found in known else None
 
 
 def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> None:

@@ -18,7 +18,7 @@ from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import FrozenEncoder
 from .ensembling import ensemble
-from .features import check_features, describe, made_in, open_patches
+from .features import check_features, computed_by, describe, made_in, open_patches
 from .heads import ChunkErrors, ChunkHeads, chunk_errors
 from .precision import check_native, resolve_precision
 from .readouts import READOUTS
@@ -144,6 +144,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
         if mode and self.config.feature_column is None:  # images: what the heads learn from is our own
             self.config.backbone_trained_precision = self.backbone.precision
+            self.config.backbone_trained_runtime = self.backbone.runtime
         total, count = self._heldout
         if mode and count:
             self._heldout = [0.0, 0]
@@ -210,6 +211,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         trained = made_in(config.feature_column) or config.backbone_trained_precision
         config.backbone_precision = resolve_precision(config.backbone_precision, config.device, trained)
         config.backbone_trained_precision = trained or config.backbone_precision
+        config.backbone_trained_runtime = computed_by(config.feature_column) or config.backbone_trained_runtime
 
     def _check_column(self, sha256: str | None) -> None:
         """Refuse features of another encoder than this one with weights of that hash."""
@@ -237,11 +239,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             open_patches(root)
 
     def _log_crossing(self, image: Tensor) -> None:
+        """Log that features are computed otherwise than those that the heads learned from, and how far they differ."""
         precision, trained = self.config.backbone_precision, self.config.backbone_trained_precision
-        if precision != trained:
-            crossing = f"frozen_vit, trained on features in {trained}, acts on features in {precision}"
-            share = 100 * self.backbone.drift(image, trained)
-            logger.warning("%s; on its first image they differ by %.2f %% of their norm.", crossing, share)
+        on_cpu = self.config.backbone_trained_runtime == "openvino" and self.backbone.device.type != "cpu"
+        if precision != trained or on_cpu:
+            learned, acts = ("of a CPU ", f"of {self.backbone.device} ") if on_cpu else ("", "")
+            crossing = f"frozen_vit, trained on features {learned}in {trained}, acts on features {acts}in {precision}"
+            share = 100 * self.backbone.drift(image, trained, on_cpu)
+            logger.warning("%s; on its first image they differ by %.2g %% of their norm.", crossing, share)
 
     def _load_backbone(self) -> None:
         config = self.config
@@ -333,7 +338,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if not self.config.use_state:
             return (pooled,)
         if OBS_STATE not in batch:
-            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which --env.obs_type=pixels_agent_pos shows.")
+            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
         return pooled, batch[OBS_STATE]
 
     @torch.no_grad()

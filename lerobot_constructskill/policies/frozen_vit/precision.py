@@ -1,12 +1,17 @@
 """The number format that a backbone computes in: what a device does natively, and what `auto` means on it."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
 from lerobot_constructskill.errors import InputError, MachineError
 
 PRECISIONS = ("float32", "bfloat16")
+
+RUNTIMES = ("openvino", "torch")
+"""What may compute a backbone's features: OpenVINO on a CPU, or PyTorch."""
 
 AUTO = "auto"
 """That of the feature set or checkpoint, where there is one, or else the fastest that the device does natively."""
@@ -61,7 +66,7 @@ def check_native(precision: str, device: torch.device | str) -> None:
     if not is_native(precision, device):
         raise NotNativeError(
             f"This {torch.device(device).type} can only emulate {precision}, up to 60 times slower than float32: use "
-            f"--policy.backbone_precision=float32, with which what was made in {precision} runs as well and logs "
+            f"backbone_precision=float32, with which what was made in {precision} runs as well and logs "
             "how far its features drift."
         )
 
@@ -75,3 +80,22 @@ def _cpu_multiplies_bfloat16() -> bool:
         return False
     # Since 2.11 torch has this as `get_capabilities`; LeRobot takes 2.7 as well. Whatever has AMX has it for bfloat16.
     return torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported()
+
+
+@contextmanager
+def computing_in(precision: str, device: torch.device) -> Iterator[None]:
+    """Compute in a precision, whatever the code around has chosen by autocast or by TF32.
+
+    LeRobot wraps a policy in autocast where `use_amp` is true. Its commands also switch on TF32, in which a GPU
+    multiplies numbers of float32 with 10 bits of mantissa instead of 23.
+    """
+    flags = torch.backends.cuda.matmul, torch.backends.cudnn
+    before = [flag.allow_tf32 for flag in flags]
+    try:
+        for flag in flags:
+            flag.allow_tf32 = False
+        with torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bfloat16"):
+            yield
+    finally:
+        for flag, allowed in zip(flags, before, strict=True):
+            flag.allow_tf32 = allowed

@@ -13,6 +13,9 @@ POOLED = "observation.pooled"
 type Batches = Mapping[int, dict]
 """Preprocessed batches of one frame each, by their policy's number."""
 
+type Seen = dict[int, dict | Exception]
+"""The same with what an encoder made of the image, or with the exception that it raised."""
+
 
 class SharedEyes:
     """Puts what their readouts take of an image in place of the image, for policies of which many may see alike.
@@ -30,13 +33,20 @@ class SharedEyes:
             policy.backbone = memory.policy.backbone
             self._members[number] = key
 
-    def __call__(self, batches: Batches) -> dict[int, dict]:
-        """Return the batches, each with `POOLED`; a batch without the image stays as it is."""
-        seen = dict(batches)
+    def __call__(self, batches: Batches) -> Seen:
+        """Return the batches, each with `POOLED`; a batch without the image stays as it is.
+
+        An encoder that fails fails for the policies that share it, whose exception stands in place of their batches.
+        """
+        seen: Seen = dict(batches)
         for key, memory in self._groups.items():
             image_key = memory.policy.config.image_key
             numbers = [number for number in batches if self._members[number] == key and image_key in batches[number]]
-            pooled = memory.pool([batches[number][image_key] for number in numbers])
+            try:
+                pooled = memory.pool([batches[number][image_key] for number in numbers])
+            except Exception as error:
+                seen |= dict.fromkeys(numbers, error)
+                continue
             for number, of_image in zip(numbers, pooled, strict=True):
                 rest = {name: value for name, value in batches[number].items() if name != image_key}
                 seen[number] = rest | {POOLED: of_image}

