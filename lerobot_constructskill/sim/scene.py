@@ -31,6 +31,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.clipping import Clipping
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import looking_from, seen_from
@@ -218,6 +219,7 @@ class PickPlaceEnv(BaseEnv):
         self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._placed = torch.zeros_like(self._lifted)
         self._last_unsettled = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._clipping = Clipping(self.num_envs, self.device)
 
     def _load_hall(self) -> None:
         """Ground plane, and the plastered walls of the building around it; the walls do not collide."""
@@ -287,6 +289,7 @@ class PickPlaceEnv(BaseEnv):
             self._lifted[env_idx] = False
             self._placed[env_idx] = False
             self._last_unsettled[env_idx] = 0
+            self._clipping.steps[env_idx] = 0
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
         """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
@@ -309,8 +312,10 @@ class PickPlaceEnv(BaseEnv):
     # Action
 
     def _step_action(self, action):
-        if self.hold is not None and action is not None and self.control_mode == HOLDING:
-            action = self.hold.apply(common.to_tensor(action, device=self.device), self.agent.tcp.pose.q)
+        if self.control_mode == HOLDING and isinstance(action, np.ndarray | torch.Tensor):
+            action = self._clipping.apply(common.to_tensor(action, device=self.device), self.elapsed_steps)
+            if self.hold is not None:
+                action = self.hold.apply(action, self.agent.tcp.pose.q)
         return super()._step_action(action)
 
     # Success
@@ -332,7 +337,7 @@ class PickPlaceEnv(BaseEnv):
         return (x, y, z + RIM_ALLOWANCE)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Named booleans of shape (num_envs,); calling it twice in one step changes nothing."""
+        """Named booleans and `clipped_steps`, each (num_envs,); calling it twice in one step changes nothing."""
         center = self.object.pose.p
         offset = (center - self.bin.pose.p).abs()
         is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
@@ -347,6 +352,7 @@ class PickPlaceEnv(BaseEnv):
             "is_gripper_open": is_gripper_open,
             "is_placed": self._placed.clone(),
             "success": self._placed.clone(),
+            "clipped_steps": self._clipping.steps.clone(),
         }
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:

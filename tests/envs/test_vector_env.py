@@ -75,7 +75,11 @@ class Scene:
         return {"sensor_data": {name: {"rgb": pixel} for name in ("base", "wrist")}}
 
     def _info(self):
-        return {"success": torch.tensor(self.n >= self.ends), "is_lifted": torch.tensor([True] * 3)}
+        return {
+            "success": torch.tensor(self.n >= self.ends),
+            "is_lifted": torch.tensor([True] * 3),
+            "clipped_steps": torch.zeros(3),
+        }
 
 
 def test_an_ended_episode_freezes_while_the_others_go_on(monkeypatch):

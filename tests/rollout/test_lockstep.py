@@ -101,7 +101,7 @@ def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on(conf
 
     monkeypatch.setattr(unready, "reset", no_beginning)
     monkeypatch.setattr(sightless, "preprocessor", no_image)
-    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    hover = Broken(np.array([0, 0, 0.5, GRIPPER_CLOSED], dtype=np.float32))
     found = (rollout for _, rollout in sorted(roll_out([unready, hover, sightless, sharing], ENV, SEEDS, n_workers=2)))
     not_begun, fine, unseen, seen = found
     assert "no beginning" in str(not_begun.error) and isinstance(unseen.error, KeyError)
@@ -156,11 +156,14 @@ def test_a_failing_agent_is_recorded_and_the_others_go_on():
     assert "finite" in str(refused.error) and refused.episodes == []
     assert fine.error is None
     assert [(e.evaluation_seed, e.steps, e.stage) for e in fine.episodes] == [(s, STEPS, "none") for s in SEEDS]
+    assert [e.clipped_steps for e in fine.episodes] == [STEPS] * len(SEEDS), "it asks for 0.5 m a step"
 
 
 def step(**info):
     state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
-    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False} | info)
+    return Step(
+        {}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0} | info
+    )
 
 
 def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
