@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_constructskill.envs.gym_env import UNBORN, ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
-from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.errors import InputError
 
 
 def check_unperturbed(perturb: str) -> None:
@@ -73,7 +73,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         if len(seeds) != self.num_envs:
             raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
         if self._env is None:
-            self._env = self._make_scene()
+            self._env = self._single.make_scene(self.num_envs)
         # As in `ConstructSkillEnv`: PhysX would keep contacts.
         obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
         self._steps = 0
@@ -128,17 +128,6 @@ class NativeVectorEnv(gym.vector.VectorEnv):
     def _check_started(self) -> None:
         if self._env is None:
             raise RuntimeError(UNBORN)
-
-    def _make_scene(self) -> gym.Env:
-        try:
-            return self._single.make_scene(self.num_envs)
-        except RuntimeError as error:
-            if "cuda" not in str(error):
-                raise
-            raise MachineError(
-                f"{self.num_envs} environments in one simulator need a GPU, and there is none ({error}); use one, or "
-                "--env.vectorization=process."
-            ) from None
 
     def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
         cameras = self._single.cameras

@@ -35,7 +35,7 @@ from lerobot_constructskill.sim.clipping import Clipping
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import looking_from, seen_from
-from lerobot_constructskill.sim.rendering import best_render_backend
+from lerobot_constructskill.sim.rendering import best_render_backend, machine_lacks
 from lerobot_constructskill.sim.shader import colour_shader
 from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
 
@@ -53,9 +53,6 @@ FINGER_OPEN = 0.038
 
 PLACED_STEPS = 5
 """Consecutive steps inside the bin, gripper open, that make a placement (paper, section III)."""
-
-NO_DEVICE = ("vk::", "vulkan", "rendering device", "physical device")
-"""What SAPIEN's errors say, in lower case, where there is nothing to render with."""
 
 HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
 
@@ -95,8 +92,9 @@ class PickPlaceEnv(BaseEnv):
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
-        OSError: there is no Vulkan device to render with.
-        ValueError: another brick size is asked of a task without a brick.
+        OSError: there is no Vulkan device to render with, no window to show, or no GPU for several environments.
+        ValueError: another brick size is asked of a task without a brick, a dense reward, or an observation or control
+            mode that there is not.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
     environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
@@ -147,6 +145,11 @@ class PickPlaceEnv(BaseEnv):
                 "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
                 "`constructskill-doctor` says what is missing."
             )
+        if kwargs.get("reward_mode") not in (None, *self.SUPPORTED_REWARD_MODES):
+            raise InputError(
+                "reward_mode must be sparse (the stage reached: 0, 0.5 once lifted, 1 once placed) or none, not "
+                f"'{kwargs['reward_mode']}': there is no dense reward."
+            )
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot
@@ -162,12 +165,12 @@ class PickPlaceEnv(BaseEnv):
                 render_backend=render_backend,
                 **kwargs,
             )
+        except AssertionError as error:  # ManiSkill's sentence about one of its arguments
+            raise InputError(str(error)) from error
         except RuntimeError as error:
-            if not any(word in str(error).lower() for word in NO_DEVICE):
+            if (lack := machine_lacks(error)) is None:
                 raise
-            raise MachineError(
-                f"There is no Vulkan device to render with ({error}); `constructskill-doctor` says what is missing."
-            ) from None
+            raise lack from None
 
     @property
     def _default_sim_config(self) -> SimConfig:
