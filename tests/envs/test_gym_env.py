@@ -7,6 +7,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -274,12 +275,14 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs):
             frozen, _, _, truncated, info = vector.step(np.stack([UP_CLOSED, UP_CLOSED]))
             assert info["is_success"].shape == (2,)
         assert truncated.all()
-        for _ in range(2):  # after its end an episode stands still, whatever is asked for
-            after, reward, *_ = vector.step(np.stack([HOVER, HOVER]))
+        assert vector.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.DISABLED
+        for _ in range(3):  # after its end an episode stands still, whatever is asked for, and stays ended
+            after, reward, terminated, truncated, _ = vector.step(np.stack([HOVER, HOVER]))
             np.testing.assert_array_equal(after["agent_pos"], frozen["agent_pos"])
-            assert (reward == 0).all()
+            assert (reward == 0).all() and truncated.all() and not terminated.any()
         again, _ = vector.reset(seed=[7, 8])
         np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
+        assert not np.any(vector.step(np.stack([HOVER, HOVER]))[2:4])
     finally:
         vector.close()
 

@@ -101,7 +101,7 @@ def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on(conf
 
     monkeypatch.setattr(unready, "reset", no_beginning)
     monkeypatch.setattr(sightless, "preprocessor", no_image)
-    hover = Broken(np.array([0, 0, 0.5, GRIPPER_CLOSED], dtype=np.float32))
+    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
     found = (rollout for _, rollout in sorted(roll_out([unready, hover, sightless, sharing], ENV, SEEDS, n_workers=2)))
     not_begun, fine, unseen, seen = found
     assert "no beginning" in str(not_begun.error) and isinstance(unseen.error, KeyError)
@@ -149,7 +149,7 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
 
 
 def test_a_failing_agent_is_recorded_and_the_others_go_on():
-    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    hover = Broken(np.array([0, 0, 0.5, GRIPPER_CLOSED], dtype=np.float32))
     agents = [Broken(None), hover, Broken(np.full(4, np.nan, dtype=np.float32))]
     failed, fine, refused = (outcome for _, outcome in sorted(roll_out(agents, ENV, SEEDS, n_workers=2)))
     assert "lost the plot" in str(failed.error) and failed.episodes == []
