@@ -3,6 +3,7 @@
 It is `meta/contract.json` of every data set and `contract` of every environment.
 """
 
+from collections.abc import Iterable
 from math import degrees
 from typing import Any
 
@@ -19,7 +20,6 @@ from lerobot_constructskill.contract import (
     GRIPPER_OPEN,
     IMAGE_SIZE,
     MOVED_SHARE,
-    OBS_TYPES,
     ROBOT_BASE,
     ROTATION,
     STATE_NAMES,
@@ -33,13 +33,14 @@ BASE_FRAME = "robot base: x forward, y to the left, z up; parallel to the world'
 STATE_UNITS = dict(zip(STATE_NAMES, ("m",) * 3 + ("rad",) * 3 + ("m",) * 2, strict=True))
 
 
-def describe(task: Task, obs_type: str, has_state: bool = True) -> dict[str, Any]:
-    """The contract of `task` seen as `obs_type`, as it is written to JSON.
+def describe(task: Task, cameras: Iterable[str], has_state: bool = True) -> dict[str, Any]:
+    """The contract of `task`, as it is written to JSON.
 
-    Cameras are those of the task as it is: a perturbation that moves one is not told.
+    A perturbation that moves a camera is not told.
 
     Args:
-        has_state: `observation.state` is there too, as in every data set.
+        cameras: those that are shown, by their names in `contract.CAMERAS`.
+        has_state: `observation.state` is shown too, as in every data set.
     """
     state = {"state": _describe_state()} if has_state else {}
     return {
@@ -53,7 +54,7 @@ def describe(task: Task, obs_type: str, has_state: bool = True) -> dict[str, Any
         },
         "action": _describe_action(task.action_names),
         **state,
-        "cameras": {name: _describe_camera(CAMERAS[name]) for name in OBS_TYPES[obs_type]},
+        "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
     }
 
 

@@ -120,7 +120,7 @@ def render(facts: dict[str, Any]) -> str:
         fps=FPS,
         seed_start=DEMO_SEED_START,
         cameras=cameras,
-        contract=describe(task, facts["generator"]["obs_type"]),
+        contract=describe(task, [camera.name for camera in cameras]),
         features={name: feature for name, feature in features.items() if name in MEANINGS},
         meanings=MEANINGS
         | (ADVISED if "dagger" in facts or facts["generator"]["labels"] == "advice" else {})

@@ -167,7 +167,7 @@ class ConstructSkillEnv(gym.Env):
     @property
     def contract(self) -> dict[str, Any]:
         """What actions and observations mean, as `interface.describe` says it: units, ranges, frames and cameras."""
-        return describe(self._row, self.obs_type, has_state=self.obs_type == "pixels_agent_pos")
+        return describe(self._row, self.cameras, has_state=self.obs_type == "pixels_agent_pos")
 
     # For experts and recorders
 

@@ -1,6 +1,7 @@
 """The environment as Gymnasium and LeRobot see it."""
 
 import gc
+import json
 import os
 import subprocess
 import sys
@@ -116,6 +117,12 @@ def test_config_and_environment_declare_the_same_features(task, obs_type):
     assert ("observation.state" in features) == ("agent_pos" in env.observation_space.spaces)
     assert env.task_description == TASKS[task].instruction
     assert env._max_episode_steps == TASKS[task].horizon
+    channels = env.contract["action"]["channels"]
+    assert [channel["name"] for channel in channels] == list(TASKS[task].action_names)
+    for edge in ("low", "high"):
+        np.testing.assert_allclose([channel[edge] for channel in channels], getattr(env.action_space, edge))
+    assert {camera["key"] for camera in env.contract["cameras"].values()} == cameras
+    assert ("state" in env.contract) == ("observation.state" in features)
     config.__post_init__()
     assert env_to_policy_features(config) == features
 
@@ -261,7 +268,9 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs):
     config = ConstructSkillEnvConfig(obs_type="pixels_agent_pos", episode_length=3)
     vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
     try:
-        obs, _ = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        obs, info = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        own = ConstructSkillEnv(**config.gym_kwargs).contract
+        assert [json.loads(text) for text in info["contract"]] == list(vector.call("contract")) == [own, own]
         if not use_async_envs:
             check_env_attributes_and_types(vector)
         assert list(vector.call("_max_episode_steps")) == [3, 3]

@@ -3,6 +3,8 @@
 That several copies freeze and are seeded one by one is tested on a scene of ours that stands in for PhysX on a GPU.
 """
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -21,6 +23,7 @@ def trajectory(config, seed):
     (vector,) = config.create_envs(n_envs=1)["constructskill"].values()
     seen = [vector.reset(seed=[seed], options={"lerobot_new_rollout": True})]
     check_env_attributes_and_types(vector)
+    assert json.loads(seen[0][-1]["contract"][0]) == vector.call("contract")[0]
     seen += [vector.step(action) for action in ACTIONS]
     assert vector.call("render")[0].dtype == np.uint8
     assert vector.unwrapped.metadata["render_fps"] == 20
