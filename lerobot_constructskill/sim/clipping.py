@@ -17,7 +17,7 @@ class Clipping:
     """Clips the actions of `num_envs` episodes and counts them, by environment.
 
     An action counts where a translation or rotation is out of range. A gripper that is asked to open wider than wide
-    loses nothing by it.
+    loses nothing by it, and its controller clips it.
     """
 
     has_told: ClassVar[bool] = False
@@ -26,12 +26,15 @@ class Clipping:
         self.steps = torch.zeros(num_envs, dtype=torch.int32, device=device)
 
     def apply(self, action: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
-        """`action`, (7,) or (num_envs, 7) of ManiSkill's normalised numbers, within [-1, 1].
+        """`action`, (7,) or (num_envs, 7) of ManiSkill's normalised numbers, its motion within [-1, 1].
 
         Args:
             before: steps that the episodes have taken before this one, (num_envs,).
         """
-        self.steps += (action[..., :-1].abs() > 1).any(dim=-1)
+        is_beyond = (action[..., :-1].abs() > 1).any(dim=-1)
+        if not is_beyond.any():
+            return action
+        self.steps += is_beyond
         if not Clipping.has_told:
             self._tell(before + 1)
         return action.clamp(-1, 1)

@@ -79,7 +79,7 @@ def test_the_count_is_an_episodes_own_and_is_recorded(tmp_path, monkeypatch):
 def counted(clipping, *actions):
     for step, action in enumerate(actions):
         out = clipping.apply(torch.tensor(action, dtype=torch.float32), torch.tensor([step] * len(clipping.steps)))
-        assert out.abs().max() <= 1
+        assert out[..., :-1].abs().max() <= 1
     return clipping.steps.tolist()
 
 
