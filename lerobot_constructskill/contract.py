@@ -27,6 +27,9 @@ ROBOT_BASE = (-0.615, 0.0, 0.0)
 
 GRIPPER_OPEN, GRIPPER_CLOSED = 1.0, -1.0
 
+TCP_IN_HAND = (0.0, 0.0, 0.1034)
+"""The end effector, which is the point between the fingertips, in the frame of the link `panda_hand`, in metres."""
+
 TRANSLATION = ("dx", "dy", "dz")
 """End-effector displacement asked for in one step, in metres, in the robot's base frame."""
 
@@ -36,8 +39,17 @@ ROTATION = ("droll", "dpitch", "dyaw")
 ROTATION_SIGN = -1
 """ManiSkill's `pd_ee_delta_pose` takes rotations the other way round: it scales them by its lower bound."""
 
+MOVED_SHARE = 0.4
+"""Share of what a step asks for that the hand moves in it, because a target counts from where the hand is.
+
+Measured by benchmarks/response.py. In y and z the first step after a rest moves half of that.
+"""
+
 GRIPPER = "gripper"
-"""Last action channel: +1 open, -1 closed."""
+"""Last action channel, continuous: +1 open, -1 closed, in between as `FINGER_TARGETS` says."""
+
+FINGER_TARGETS = (-0.01, 0.04)
+"""Position in metres that each finger is driven to at -1 and at +1, linear in between: at 0 it is 0.015 m."""
 
 STATE_NAMES = ("ee_x", "ee_y", "ee_z", "ee_rx", "ee_ry", "ee_rz", "finger_left", "finger_right")
 """Proprioception: position in metres and axis-angle in radians in the robot's base frame, fingers in metres."""

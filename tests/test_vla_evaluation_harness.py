@@ -18,10 +18,13 @@ import numpy as np
 import pytest
 import yaml
 from commands import call
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
 from random_features import config, tiny_weights  # noqa: F401
 
 from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, OBS_TYPES, REWARD_PLACED, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.sim.clipping import LEAST, Clipping
 
 pytest.importorskip("vla_eval", reason="extra `evaluators`")
 
@@ -29,7 +32,15 @@ from vla_eval.config import EvalConfig
 from vla_eval.registry import resolve_import_string
 from vla_eval.render import apply_render_mode
 from vla_eval.runners.sync_runner import SyncEpisodeRunner
-from vla_eval.specs import check_specs
+from vla_eval.specs import (
+    GRIPPER_CLOSE_NEG,
+    GRIPPER_CLOSE_POS,
+    IMAGE_RGB,
+    POSITION_DELTA,
+    ROTATION_AA,
+    STATE_JOINT,
+    check_specs,
+)
 
 FOLDER = Path(__file__).parents[1] / "examples" / "vla_evaluation_harness"
 ENTRIES = yaml.safe_load((FOLDER / "eval.yaml").read_text())["benchmarks"]
@@ -84,10 +95,22 @@ def test_the_expert_succeeds_through_the_harness(benchmark_class, monkeypatch):
     assert result["metrics"] == {"success": True, "lifted": True} == dict.fromkeys(benchmark.get_metric_keys(), True)
     assert result == teacher.result and 60 < result["steps"] < steps
     assert benchmark._last_result.reward == REWARD_PLACED and benchmark.render().ndim == 3
+    assert benchmark._last_result.info["clipped_steps"] == 0
     with pytest.raises(ValueError, match="4 finite numbers"):
         benchmark.step({"actions": np.zeros(5)})
     benchmark.cleanup()
     assert benchmark.render() is None
+
+
+@pytest.mark.sim
+def test_a_model_that_sends_normalised_actions_is_told_so(benchmark_class, monkeypatch, caplog):
+    monkeypatch.setattr(Clipping, "has_told", False)
+    benchmark = benchmark_class(tasks="brick_to_bin")
+    (task,) = benchmark.get_tasks()
+    asyncio.run(benchmark.start_episode(task))
+    steps = [benchmark.step({"actions": [0.6, -0.4, 0.9, 0, 0, 0, 1]}) for _ in range(LEAST)]
+    benchmark.cleanup()
+    assert steps[-1].info["clipped_steps"] == LEAST and "were clipped" in caplog.text
 
 
 @pytest.mark.sim
@@ -120,7 +143,21 @@ def test_every_entry_of_the_yaml_makes_a_benchmark(entry, benchmark_class):
 
 def test_a_task_that_turns_says_so(benchmark_class):
     spec = benchmark_class(tasks="brick_to_bin_turned").get_action_spec()
-    assert spec["rotation"].format == "delta_dyaw" and sum(part.dims for part in spec.values()) == 5
+    assert spec["rotation"].format == "delta_dyaw_radians" and sum(part.dims for part in spec.values()) == 5
+
+
+def test_a_model_with_another_contract_is_told_field_by_field_before_the_first_episode(benchmark_class):
+    benchmark = benchmark_class(tasks="brick_to_bin_turned")
+    own, seen = benchmark.get_action_spec(), benchmark.get_observation_spec()
+    theirs = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+    told = check_specs(theirs, own, {"wrist": IMAGE_RGB, "state": STATE_JOINT}, seen)
+    assert sorted(line.split(":")[0] for line in told) == [
+        "action [gripper]",
+        "action [position]",
+        "action [rotation]",
+        "observation [state]",
+    ]
+    assert check_specs(own | {"gripper": GRIPPER_CLOSE_NEG}, own, seen, seen) == []
 
 
 def test_holding_keeps_the_gripper_and_moves_nothing(benchmark_class):
@@ -132,9 +169,6 @@ def test_holding_keeps_the_gripper_and_moves_nothing(benchmark_class):
 @pytest.fixture(params=["base"])
 def untrained(request, config, tmp_path) -> Path:  # noqa: F811
     """A checkpoint of frozen_vit as LeRobot keeps one, its heads random, which looks through one camera."""
-    from lerobot.configs import FeatureType, PolicyFeature
-    from lerobot.policies import make_pre_post_processors
-
     from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 
     fields = config(save_backbone=True, camera=request.param)
@@ -159,6 +193,19 @@ def test_the_model_server_gives_a_policy_the_camera_that_it_was_trained_on(untra
     assert sees(cameras) == {own: f"observation.images.{own}"}
     assert sees(cameras, image_keys={"base": own}) == {"base": f"observation.images.{own}"}
     assert sees({"front": None}) == {"front": f"observation.images.{own}"}
+
+
+@pytest.mark.parametrize("reach, grip, told", [(0.05, -1, []), (0.9, -1, ["position"]), (0.05, 0, ["gripper"])])
+def test_the_model_server_says_what_its_checkpoint_was_trained_to_send(untrained, benchmark_class, reach, grip, told):
+    fields = PreTrainedConfig.from_pretrained(untrained)
+    stats = {"min": [-0.02, -reach, -0.04, grip], "max": [0.01, 0.04, reach, 1.0], "mean": [0.0] * 4, "std": [1.0] * 4}
+    for processor in make_pre_post_processors(fields, dataset_stats={"action": stats}):
+        processor.save_pretrained(untrained)
+    server = resolve_import_string("model_server:ModelServer")("frozen_vit", str(untrained), device="cpu")
+    benchmark = benchmark_class(tasks="brick_to_bin")
+    asked, seen = benchmark.get_action_spec(), benchmark.get_observation_spec()
+    found = check_specs(server.get_action_spec(), asked, server.get_observation_spec(), seen)
+    assert [line.split("]")[0] for line in found] == [f"action [{field}" for field in told]
 
 
 def wait_for(address: str, server: subprocess.Popen) -> None:

@@ -3,19 +3,18 @@
 import os
 from typing import Any, ClassVar
 
+import constructskill_specs as specs
 import numpy as np
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.render import apply_env
-from vla_eval.specs import GRIPPER_CLOSE_NEG, IMAGE_RGB, LANGUAGE, STATE_EEF_POS_AA_GRIP, DimSpec
+from vla_eval.specs import IMAGE_RGB, LANGUAGE, STATE_EEF_POS_AA_GRIP, DimSpec
 from vla_eval.types import Action, EpisodeResult, Observation, Task
 
 from lerobot_constructskill.contract import (
-    ACTION_SCALE,
     GRIPPER_OPEN,
     OBS_TYPES,
     REWARD_LIFTED,
     ROTATION,
-    TRANSLATION,
     get_task,
     select_tasks,
 )
@@ -128,14 +127,9 @@ class ConstructSkillBenchmark(StepBenchmark):
         return {"max_steps": self._max_steps or max(row.horizon for _, row in self._rows)}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        reach = (-ACTION_SCALE, ACTION_SCALE)
         turns = [name for name in self._rows[0][1].action_names if name in ROTATION]
-        rotation = DimSpec("rotation", len(turns), "delta_" + "_".join(turns), reach, description="radians per step")
-        return {
-            "position": DimSpec("position", len(TRANSLATION), "delta_xyz", reach, description="metres per step"),
-            **({"rotation": rotation} if turns else {}),
-            "gripper": GRIPPER_CLOSE_NEG,
-        }
+        rotation = {"rotation": specs.rotation(turns)} if turns else {}
+        return {"position": specs.POSITION, **rotation, "gripper": specs.GRIPPER}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         cameras = dict.fromkeys(OBS_TYPES[OBS_TYPE], IMAGE_RGB)

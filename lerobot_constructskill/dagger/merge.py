@@ -17,7 +17,7 @@ from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.columns import EXPERT, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
-from lerobot_constructskill.demos.modality import MODALITY, modality
+from lerobot_constructskill.demos.modality import write_meanings
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.progress import quiet
 
@@ -50,7 +50,7 @@ def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, 
         _add_columns(plan, base, first)
         aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))
     write_statistics(folder)
-    (folder / MODALITY).write_text(json.dumps(modality(plan.task, plan.base.obs_type), indent=2) + "\n")
+    write_meanings(folder, plan.task, plan.base.obs_type)
     facts = json.loads((base.root / SIDECAR).read_text())
     facts["dagger"] = {
         "policy": plan.checkpoint(0).spec["policy"],

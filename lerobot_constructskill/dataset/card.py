@@ -11,6 +11,7 @@ from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.interface import describe
 
 Version = Annotated[str, Pattern(r"[\w.+!-]{1,64}", "a version")]
 
@@ -119,6 +120,7 @@ def render(facts: dict[str, Any]) -> str:
         fps=FPS,
         seed_start=DEMO_SEED_START,
         cameras=cameras,
+        contract=describe(task, [camera.name for camera in cameras]),
         features={name: feature for name, feature in features.items() if name in MEANINGS},
         meanings=MEANINGS
         | (ADVISED if "dagger" in facts or facts["generator"]["labels"] == "advice" else {})

@@ -13,7 +13,7 @@ from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.demos.modality import MODALITY, modality
+from lerobot_constructskill.demos.modality import write_meanings
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
 from lerobot_constructskill.errors import InputError
@@ -46,8 +46,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     with tempfile.TemporaryDirectory(dir=shards) as scratch, room_for(folder):
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
-    task = get_task(config.task)
-    (folder / MODALITY).write_text(json.dumps(modality(task, config.obs_type), indent=2) + "\n")
+    write_meanings(folder, get_task(config.task), config.obs_type)
     facts = {
         "generator": generator_facts(config) | {"light_robot": attempts[0].light_robot},
         "noise_covariance": (config.noise.root @ config.noise.root).tolist(),

@@ -1,10 +1,13 @@
-"""GR00T's `meta/modality.json`: which numbers of the state and the action belong together."""
+"""What a data set says of its numbers: GR00T's `meta/modality.json` and our `meta/contract.json`."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.contract import CAMERAS, GRIPPER, OBS_TYPES, ROTATION, STATE_NAMES, TRANSLATION, Task
+from lerobot_constructskill.interface import describe
 
-MODALITY = "meta/modality.json"
+MODALITY, CONTRACT = "meta/modality.json", "meta/contract.json"
 
 STATE_PARTS = {
     "end_effector_position": STATE_NAMES[:3],
@@ -14,8 +17,14 @@ STATE_PARTS = {
 ACTION_PARTS = {"end_effector_position": TRANSLATION, "end_effector_rotation": ROTATION, "gripper": (GRIPPER,)}
 
 
+def write_meanings(root: Path, task: Task, obs_type: str) -> None:
+    """Write both files of a data set of `task` seen as `obs_type`."""
+    for name, content in ((MODALITY, modality(task, obs_type)), (CONTRACT, describe(task, OBS_TYPES[obs_type]))):
+        (root / name).write_text(json.dumps(content, indent=2) + "\n")
+
+
 def modality(task: Task, obs_type: str) -> dict[str, Any]:
-    """The content of the file for a data set of `task` seen as `obs_type`."""
+    """GR00T's file for a data set of `task` seen as `obs_type`: which numbers belong together."""
     return {
         "state": _spans(STATE_PARTS, STATE_NAMES),
         "action": _spans(ACTION_PARTS, task.action_names),

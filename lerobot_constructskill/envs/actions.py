@@ -35,6 +35,11 @@ def action_bounds(count: int) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
+def normalised(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Actions (..., A) with these channels in ManiSkill's numbers, of which those in [-1, 1] are within reach."""
+    return actions / np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32)
+
+
 def within_reach(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Actions (..., A) with these channels as they are executed, whatever was asked for: in ManiSkill's [-1, 1]."""
-    return np.clip(actions / np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32), -1, 1)
+    """The same as they are executed, whatever was asked for: clipped to [-1, 1]."""
+    return np.clip(normalised(actions, names), -1, 1)

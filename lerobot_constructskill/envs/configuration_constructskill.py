@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
 from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
-from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, frozen_at_end
+from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv, check_unperturbed
@@ -99,9 +99,6 @@ class ConstructSkillEnvConfig(EnvConfig):
             return NativeVectorEnv(n_envs, **kwargs)
         env_fns = [partial(ConstructSkillEnv, **kwargs) for _ in range(n_envs)]
         if use_async_envs and n_envs > 1:
-            probe = self._make_env(task)
             env_fns = [partial(recording_into, os.environ.get(FOLDER), fn) for fn in env_fns]
-            return LazyAsyncVectorEnv(env_fns, probe.observation_space, probe.action_space, probe.metadata)
-        return gym.vector.SyncVectorEnv(
-            [partial(frozen_at_end, fn) for fn in env_fns], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
-        )
+            return LazyAsyncVectorEnv(env_fns, self._make_env(task))
+        return SyncVectorEnv(env_fns)

@@ -1,9 +1,10 @@
-"""Sub-environments that stand still after their episode's end, until somebody resets them."""
+"""Sub-environments that stand still after their episode's end, until somebody resets the vector environment."""
 
 from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from lerobot_constructskill.envs.fork_server import start_fork_server
 from lerobot_constructskill.lerobot_internals import (
@@ -27,11 +28,40 @@ class FrozenAtEnd(FreezeAfterEpisodeEnd):
         return super().reset(**thawing(**given) if given else {})
 
 
-class LazyAsyncVectorEnv(_LazyAsyncVectorEnv):
+class StaysDone:
+    """A vector environment in which an episode that has ended stays `terminated` or `truncated` until `reset`.
+
+    Gymnasium's automatic reset, which a frozen sub-environment only pretends, would report every second step of it as
+    the first of a new episode.
+    """
+
+    def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
+        self._ended = np.zeros((2, self.num_envs), dtype=bool)
+        return super().reset(**given)
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = super().step(actions)
+        self._ended |= terminated, truncated
+        return obs, reward, *self._ended.copy(), info
+
+
+class SyncVectorEnv(StaysDone, gym.vector.SyncVectorEnv):
+    """Gymnasium's, of environments that freeze at their episode's end."""
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env]]):
+        super().__init__([lambda fn=fn: FrozenAtEnd(fn()) for fn in env_fns])
+        self.metadata = self.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
+
+
+class LazyAsyncVectorEnv(StaysDone, _LazyAsyncVectorEnv):
     """LeRobot's, whose workers freeze by themselves, thawed by every `reset` too.
 
     The workers are forked when they are first needed, from a server that has imported what they need.
     """
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env]], probe: gym.Env):
+        metadata = probe.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
+        super().__init__(env_fns, probe.observation_space, probe.action_space, metadata)
 
     def _ensure(self) -> None:
         start_fork_server(PRELOADED)
@@ -44,7 +74,3 @@ class LazyAsyncVectorEnv(_LazyAsyncVectorEnv):
 def thawing(seed: Any = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
     """What a `reset` is given, with LeRobot's own word that an episode is to begin."""
     return {"seed": seed, "options": (options or {}) | {NEW_ROLLOUT_OPTION: True}}
-
-
-def frozen_at_end(make: Callable[[], gym.Env]) -> gym.Env:
-    return FrozenAtEnd(make())

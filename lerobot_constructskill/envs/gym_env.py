@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import json
 import multiprocessing
 import zlib
 from typing import Annotated, Any
@@ -20,9 +21,10 @@ from lerobot_constructskill.contract import (
     STATE_NAMES,
     get_task,
 )
-from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, within_reach
+from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
 from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
+from lerobot_constructskill.interface import describe
 from lerobot_constructskill.perturbations import Perturbation
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
@@ -38,8 +40,8 @@ class ConstructSkillEnv(gym.Env):
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
     `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
     that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. The reward is
-    the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success` and the named booleans of the
-    scene, from the first reset on.
+    the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success`, the named booleans of the scene
+    and `clipped_steps`, how many of the episode's actions were clipped; after a reset also `contract`, as JSON.
 
     Non-obvious behaviours: the simulator is born on the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
@@ -133,7 +135,7 @@ class ConstructSkillEnv(gym.Env):
             for name in self.cameras
         }
         self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
-        return self._observation(obs), self._info(info)
+        return self._observation(obs), self._info(info) | {"contract": json.dumps(self.contract)}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance 1/20 s.
@@ -161,6 +163,11 @@ class ConstructSkillEnv(gym.Env):
             self._env.close()
             self._env = None
             self._has_started = False
+
+    @property
+    def contract(self) -> dict[str, Any]:
+        """What actions and observations mean, as `interface.describe` says it: units, ranges, frames and cameras."""
+        return describe(self._row, self.cameras, has_state=self.obs_type == "pixels_agent_pos")
 
     # For experts and recorders
 
@@ -225,13 +232,13 @@ class ConstructSkillEnv(gym.Env):
         return self._env
 
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:
-        """ManiSkill's normalised `pd_ee_delta_pose` action, (7,) in [-1, 1], for one of this environment's."""
+        """ManiSkill's normalised `pd_ee_delta_pose` action, (7,), for one of ours; the scene clips it to [-1, 1]."""
         action = np.asarray(action, dtype=np.float32)
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():
             raise InputError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
         scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
-        scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = within_reach(action, names)
+        scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = normalised(action, names)
         return scaled
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
@@ -252,7 +259,7 @@ class ConstructSkillEnv(gym.Env):
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
         booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
-        return {"is_success": bool(info["success"][0]), **booleans}
+        return {"is_success": bool(info["success"][0]), **booleans, "clipped_steps": int(info["clipped_steps"][0])}
 
 
 @functools.cache

@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
+from lerobot_constructskill.artifacts.tables import with_later_columns
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
@@ -73,6 +74,7 @@ class Recording(Outcome):
         obs_type: what the policy was shown.
         backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
         versions: JSON, as `deciding` gives them.
+        clipped_steps: how many of the actions were clipped; None where nobody counted.
         actions: every executed action, one after another, (steps * A) float32 as `ConstructSkillEnv.step` takes them.
     """
 
@@ -83,16 +85,18 @@ class Recording(Outcome):
     obs_type: str = ""
     backend: str = ""
     versions: str = field(default_factory=lambda: json.dumps(deciding()))
+    clipped_steps: int | None = None
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
         """Keep a copy of an executed action, (A,), and count what came of it."""
         self.actions.append(np.array(action, dtype=np.float32))
         self.count(info)
+        self.clipped_steps = info["clipped_steps"]
 
     @classmethod
     def of(cls, outcome: Outcome, actions: list[np.ndarray], **facts: Any) -> "Recording":
-        """That of an episode which has ended; `facts` are fields of it."""
+        """The recording of an episode that has ended; `facts` are the other fields of `Recording`."""
         went = {one.name: getattr(outcome, one.name) for one in fields(Outcome)}
         return cls(**went, actions=actions, **facts)
 
@@ -163,6 +167,7 @@ def read_recordings(path: Path) -> list[Recording]:
         table = pq.read_table(path)
     except pa.ArrowInvalid as error:
         raise InputError(f"'{path}' cannot be read: {error}") from None
+    table = with_later_columns(table, SCHEMA, ("clipped_steps",))
     if not table.schema.equals(SCHEMA):
         raise InputError(f"'{path}' is not a recording of this version.")
     flat = [np.asarray(actions.values) for actions in table["actions"]]

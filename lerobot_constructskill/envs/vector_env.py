@@ -4,6 +4,7 @@ With PhysX on a GPU one scene steps and renders hundreds of environments at once
 Several environments have not yet run on a GPU. One environment is tested on the CPU: it equals `ConstructSkillEnv`.
 """
 
+import json
 import os
 from collections.abc import Sequence
 from numbers import Integral
@@ -77,7 +78,8 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
         self._steps = 0
         self._done[:] = False
-        return self._observations(obs), self._infos(info)
+        contract = np.full(self.num_envs, json.dumps(self._single.contract), dtype=object)
+        return self._observations(obs), self._infos(info) | {"contract": contract}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance 1/20 s; `actions` are (n_envs, A) in metres.
@@ -135,8 +137,8 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         return seen
 
     def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
-        booleans = {name: value.cpu().numpy() for name, value in info.items() if name.startswith("is_")}
-        return {"is_success": info["success"].cpu().numpy(), **booleans}
+        names = [name for name in info if name.startswith("is_")] + ["clipped_steps"]
+        return {"is_success": info["success"].cpu().numpy(), **{name: info[name].cpu().numpy() for name in names}}
 
 
 def _keep(old: Any, new: Any, frozen: np.ndarray) -> Any:

@@ -5,16 +5,14 @@ from math import tan
 
 import numpy as np
 
-from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, Camera
+from lerobot_constructskill.cameras import axes
+from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, TCP_IN_HAND, Camera
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop
 from lerobot_constructskill.policies.frozen_vit.readouts import POINTS
 
 POSES = dict(zip(POINTS, ("sim.object_pose", "sim.bin_position", "sim.tcp_pose"), strict=True))
 """Column whose first three numbers are a point's position, in metres in the world's frame."""
-
-TCP_IN_HAND = np.array([0.0, 0.0, 0.1034])
-"""The point between the Panda's fingertips in the frame of its link `panda_hand`, in metres."""
 
 
 def find_points(columns: Mapping[str, np.ndarray], camera: str, crop: Crop | None = None) -> np.ndarray:
@@ -46,24 +44,14 @@ def find_points(columns: Mapping[str, np.ndarray], camera: str, crop: Crop | Non
 
 def _project(camera: Camera, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
     """Where a square picture shows world positions (N, 3): (N, 2), half the picture is 1."""
-    right, down, forward = _axes(camera)
+    right, down, forward = axes(camera)
     if camera.mount is None:
         offsets = positions - camera.eye
     else:
-        links = hands[:, :3] - _rotate(hands[:, 3:], TCP_IN_HAND)
+        links = hands[:, :3] - _rotate(hands[:, 3:], np.array(TCP_IN_HAND))
         offsets = _rotate(hands[:, 3:] * [1, -1, -1, -1], positions - links) - camera.eye
     depth = np.maximum(offsets @ forward, 1e-3)
     return np.stack([offsets @ right, offsets @ down], axis=1) / depth[:, None] / tan(camera.fov / 2)
-
-
-def _axes(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """To the right, down and forward: in the world, or in the frame of a link along whose z the camera looks."""
-    if camera.mount is not None:
-        return np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    forward = np.subtract(camera.target, camera.eye)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
-    return right, np.cross(forward, right), forward
 
 
 def _rotate(quaternions: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -115,15 +115,30 @@ class PolicyAgent:
 
     @torch.inference_mode()
     def decide(self, batch: dict[str, Any]) -> np.ndarray:
-        """Return the action for a batch of one."""
+        """Return the action for a batch of one.
+
+        Raises:
+            ValueError: the policy reads what the batch does not hold.
+        """
         (drawn,) = np.random.SeedSequence([self._seed, self._step]).generate_state(1)
         self._step += 1
         device = torch.device(self.policy.config.device)
         amp = torch.autocast(device.type, enabled=self.policy.config.use_amp)
         with torch.random.fork_rng([device] if device.type == "cuda" else []), amp:
             torch.manual_seed(int(drawn))
-            action = self.policy.select_action(batch)
+            action = self._select(batch)
         return self.postprocessor(action).squeeze(0).cpu().numpy()
+
+    def _select(self, batch: dict[str, Any]) -> torch.Tensor:
+        try:
+            return self.policy.select_action(batch)
+        except KeyError as error:
+            if not str(error.args[0]).startswith("observation."):
+                raise
+            raise InputError(
+                f"The policy reads {error.args[0]}, which it was not shown: obs_type=pixels_agent_pos has the wrist "
+                "camera and the state; pixels has the base camera alone."
+            ) from error
 
 
 class Lockstep:

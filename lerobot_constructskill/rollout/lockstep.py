@@ -21,10 +21,12 @@ class Episode(Outcome):
     """How an evaluation episode went; the fields are those of `rows.EpisodeRow`."""
 
     final_error_m: float | None = None
+    clipped_steps: int | None = None
 
     def add(self, step: Step) -> None:
         """Count one step of the episode."""
         self.count(step.info)
+        self.clipped_steps = step.info["clipped_steps"]
         self.final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
 
 

@@ -27,7 +27,7 @@ def enable_gpu_physics(num_envs: int, render_backend: str) -> None:
         return
     who = "This environment needs" if num_envs == 1 else f"{num_envs} environments in one simulator need"
     asked = f"{who} physics on a GPU"
-    remedy = "or use a process for each (vectorization=process)"
+    remedy = "or simulate each on the CPU (num_envs=1, sim_backend=auto; with LeRobot vectorization=process)"
     try:
         sapien.Device("cuda")
     except RuntimeError as error:

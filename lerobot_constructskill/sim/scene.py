@@ -31,11 +31,12 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.clipping import Clipping
 from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.poses import looking_from, seen_from
-from lerobot_constructskill.sim.rendering import best_render_backend
+from lerobot_constructskill.sim.rendering import best_render_backend, machine_lacks
 from lerobot_constructskill.sim.shader import colour_shader
 from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
 
@@ -53,9 +54,6 @@ FINGER_OPEN = 0.038
 
 PLACED_STEPS = 5
 """Consecutive steps inside the bin, gripper open, that make a placement (paper, section III)."""
-
-NO_DEVICE = ("vk::", "vulkan", "rendering device", "physical device")
-"""What SAPIEN's errors say, in lower case, where there is nothing to render with."""
 
 HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
 
@@ -95,8 +93,10 @@ class PickPlaceEnv(BaseEnv):
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
-        OSError: there is no Vulkan device to render with, or no GPU for several environments in one simulator.
-        ValueError: another brick size is asked of a task without a brick.
+        OSError: there is no Vulkan device to render with, no window to show, or no GPU for several environments in one
+            simulator.
+        ValueError: another brick size is asked of a task without a brick, a dense reward, or an observation or control
+            mode that there is not.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
     environment; `is_lifted` and `is_placed` hold for the rest of an episode, the other booleans are momentary.
@@ -147,6 +147,11 @@ class PickPlaceEnv(BaseEnv):
                 "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
                 "`constructskill-doctor` says what is missing."
             )
+        if kwargs.get("reward_mode") not in (None, *self.SUPPORTED_REWARD_MODES):
+            raise InputError(
+                "reward_mode must be sparse (the stage reached: 0, 0.5 once lifted, 1 once placed) or none, not "
+                f"'{kwargs['reward_mode']}': there is no dense reward."
+            )
         if steps_on_gpu(kwargs.get("sim_backend", "auto"), num_envs := kwargs.get("num_envs", 1)):
             enable_gpu_physics(num_envs, render_backend)
         self.cameras = tuple(cameras)
@@ -164,12 +169,12 @@ class PickPlaceEnv(BaseEnv):
                 render_backend=render_backend,
                 **kwargs,
             )
+        except AssertionError as error:  # ManiSkill's sentence about one of its arguments
+            raise InputError(str(error)) from error
         except RuntimeError as error:
-            if not any(word in str(error).lower() for word in NO_DEVICE):
+            if (lack := machine_lacks(error)) is None:
                 raise
-            raise MachineError(
-                f"There is no Vulkan device to render with ({error}); `constructskill-doctor` says what is missing."
-            ) from None
+            raise lack from None
 
     @property
     def _default_sim_config(self) -> SimConfig:
@@ -221,6 +226,7 @@ class PickPlaceEnv(BaseEnv):
         self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._placed = torch.zeros_like(self._lifted)
         self._last_unsettled = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._clipping = Clipping(self.num_envs, self.device)
 
     def _load_hall(self) -> None:
         """Ground plane, and the plastered walls of the building around it; the walls do not collide."""
@@ -290,6 +296,7 @@ class PickPlaceEnv(BaseEnv):
             self._lifted[env_idx] = False
             self._placed[env_idx] = False
             self._last_unsettled[env_idx] = 0
+            self._clipping.steps[env_idx] = 0
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
         """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
@@ -312,8 +319,10 @@ class PickPlaceEnv(BaseEnv):
     # Action
 
     def _step_action(self, action):
-        if self.hold is not None and action is not None and self.control_mode == HOLDING:
-            action = self.hold.apply(common.to_tensor(action, device=self.device), self.agent.tcp.pose.q)
+        if self.control_mode == HOLDING and isinstance(action, np.ndarray | torch.Tensor):
+            action = self._clipping.apply(common.to_tensor(action, device=self.device), self.elapsed_steps)
+            if self.hold is not None:
+                action = self.hold.apply(action, self.agent.tcp.pose.q)
         return super()._step_action(action)
 
     # Success
@@ -335,7 +344,7 @@ class PickPlaceEnv(BaseEnv):
         return (x, y, z + RIM_ALLOWANCE)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Named booleans of shape (num_envs,); calling it twice in one step changes nothing."""
+        """Named booleans and `clipped_steps`, each (num_envs,); calling it twice in one step changes nothing."""
         center = self.object.pose.p
         offset = (center - self.bin.pose.p).abs()
         is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
@@ -350,6 +359,7 @@ class PickPlaceEnv(BaseEnv):
             "is_gripper_open": is_gripper_open,
             "is_placed": self._placed.clone(),
             "success": self._placed.clone(),
+            "clipped_steps": self._clipping.steps.clone(),
         }
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:

@@ -178,8 +178,11 @@ def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
     start = {name: run.arm.env[name] for name in STARTING}
     told = {"backend": rollout.backend, **start}
-    pairs = zip(rollout.episodes, rollout.actions, strict=True)
-    return _write(job, run, rows, write_video, [Recording.of(episode, actions, **told) for episode, actions in pairs])
+    recordings = [
+        Recording.of(episode, actions, clipped_steps=episode.clipped_steps, **told)
+        for episode, actions in zip(rollout.episodes, rollout.actions, strict=True)
+    ]
+    return _write(job, run, rows, write_video, recordings)
 
 
 def _write_failed(job: Job, run: Run, error: Exception) -> Run:

@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.tables import with_later_columns
 from lerobot_constructskill.errors import InputError, MissingError
 
 STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
@@ -52,6 +53,8 @@ class EpisodeRow:
         place_step: first step after which it counted as placed.
         final_error_m: distance of the object from the goal's centre at the end, in metres.
         steps: length of the episode.
+        clipped_steps: how many of its actions asked for more than the controller gives; null in rows from before these
+            were counted.
         error_kind: null where the run finished; `NOT_RUN`, or what kind of failure: "weights" (of a backbone, to be
             had nowhere), "input", "missing", "taken", "machine" or "fault". Such a run has one row, episode 0.
         error: why the run failed, one sentence.
@@ -74,6 +77,7 @@ class EpisodeRow:
     place_step: int | None = None
     final_error_m: float | None = None
     steps: int | None = None
+    clipped_steps: int | None = None
     error_kind: str | None = None
     error: str | None = None
     dataset_sha256: str | None = None
@@ -145,6 +149,7 @@ def _read(path: Path, kind: type[EpisodeRow]) -> pa.Table:
         table = pq.read_table(path)
     except pa.ArrowInvalid as error:
         raise InputError(f"'{path}' cannot be read: {error}") from None
+    table = with_later_columns(table, _schema(kind), ("clipped_steps",))
     if not table.schema.equals(_schema(kind)):
         raise InputError(f"'{path}' is not a table of a study's rows in this version's form.")
     return table

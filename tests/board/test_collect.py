@@ -22,7 +22,7 @@ def recording(start, value=0.01, **facts):
     made = {"task": "block_to_bin", "episode_length": 2, "perturb": " pose=1", "backend": "physx_cpu, none rendering"}
     one = Recording(start, **made | facts)
     for _ in range(2):
-        one.add(np.full(4, value), {"is_lifted": False, "is_in_bin": False, "is_success": False})
+        one.add(np.full(4, value), {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
     return one
 
 

@@ -19,9 +19,10 @@ from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.demos.modality import modality
+from lerobot_constructskill.demos.modality import CONTRACT, modality
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.interface import describe
 from lerobot_constructskill.scripts.generate import generate
 
 CARDS = Path(__file__).parents[2] / "datasets_cards"
@@ -88,6 +89,19 @@ def test_the_training_commands_are_ones_that_lerobot_takes(card):
         mapped = json.loads(flags.get("--rename_map", "{}"))
         assert set(mapped) <= {camera.key for camera in CAMERAS.values()}
         assert ("--policy.path" in flags) == bool(mapped)
+
+
+def test_the_contract_stands_beside_the_data_and_on_the_card(card, data):
+    said = json.loads((data.root / CONTRACT).read_text())
+    assert said == describe(TASKS["brick_to_bin"], ["base"]) and said["fps"] == data.info["fps"]
+    features = data.info["features"]
+    for part in (said["action"], said["state"]):
+        assert [channel["name"] for channel in part["channels"]] == features[part["key"]]["names"]
+    for camera in said["cameras"].values():
+        assert [camera["height"], camera["width"]] == list(features[camera["key"]]["shape"])[:2]
+    for channel in said["action"]["channels"]:
+        assert f"| {channel['name']} | {channel['unit']} | {channel['low']} to {channel['high']} |" in card
+    assert "`meta/contract.json`" in card and said["action"]["meaning"] in card
 
 
 @pytest.mark.parametrize("obs_type", ["pixels", "pixels_agent_pos"])

@@ -1,12 +1,14 @@
 """The environment as Gymnasium and LeRobot see it."""
 
 import gc
+import json
 import os
 import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import forkserver, get_context
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -115,6 +117,12 @@ def test_config_and_environment_declare_the_same_features(task, obs_type):
     assert ("observation.state" in features) == ("agent_pos" in env.observation_space.spaces)
     assert env.task_description == TASKS[task].instruction
     assert env._max_episode_steps == TASKS[task].horizon
+    channels = env.contract["action"]["channels"]
+    assert [channel["name"] for channel in channels] == list(TASKS[task].action_names)
+    for edge in ("low", "high"):
+        np.testing.assert_allclose([channel[edge] for channel in channels], getattr(env.action_space, edge))
+    assert {camera["key"] for camera in env.contract["cameras"].values()} == cameras
+    assert ("state" in env.contract) == ("observation.state" in features)
     config.__post_init__()
     assert env_to_policy_features(config) == features
 
@@ -272,7 +280,9 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs, fresh_fork
     config = ConstructSkillEnvConfig(obs_type="pixels_agent_pos", episode_length=3)
     vector = config.create_envs(n_envs=2, use_async_envs=use_async_envs)["constructskill"][0]
     try:
-        obs, _ = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        obs, info = vector.reset(seed=[7, 8], options=NEW_ROLLOUT)
+        own = ConstructSkillEnv(**config.gym_kwargs).contract
+        assert [json.loads(text) for text in info["contract"]] == list(vector.call("contract")) == [own, own]
         if not use_async_envs:
             check_env_attributes_and_types(vector)
         assert list(vector.call("_max_episode_steps")) == [3, 3]
@@ -286,12 +296,14 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs, fresh_fork
             frozen, _, _, truncated, info = vector.step(np.stack([UP_CLOSED, UP_CLOSED]))
             assert info["is_success"].shape == (2,)
         assert truncated.all()
-        for _ in range(2):  # after its end an episode stands still, whatever is asked for
-            after, reward, *_ = vector.step(np.stack([HOVER, HOVER]))
+        assert vector.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.DISABLED
+        for _ in range(3):  # after its end an episode stands still, whatever is asked for, and stays ended
+            after, reward, terminated, truncated, _ = vector.step(np.stack([HOVER, HOVER]))
             np.testing.assert_array_equal(after["agent_pos"], frozen["agent_pos"])
-            assert (reward == 0).all()
+            assert (reward == 0).all() and truncated.all() and not terminated.any()
         again, _ = vector.reset(seed=[7, 8])
         np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
+        assert not np.any(vector.step(np.stack([HOVER, HOVER]))[2:4])
         if use_async_envs:  # a worker that inherits CUDA can use neither it nor Vulkan on a GPU
             with ProcessPoolExecutor(1, get_context("forkserver")) as pool:
                 assert not pool.submit(cannot_use_cuda).result()

@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from lerobot_constructskill.contract import get_task
@@ -18,12 +19,17 @@ DOWN_OPEN = np.array([0.01, 0.02, -0.03, 1], dtype=np.float64)
 
 def test_recordings_are_read_as_they_were_written(tmp_path):
     made = [Recording(7, lifted=True, stage="lifted", lift_step=2, task="brick_to_bin"), Recording(8)]
-    made[0].add(np.float32([0.1, 0, -0.1, 1]), {"is_lifted": True, "is_in_bin": False, "is_success": False})
+    made[0].add(
+        np.float32([0.1, 0, -0.1, 1]), {"is_lifted": True, "is_in_bin": False, "is_success": False, "clipped_steps": 0}
+    )
     write_recordings(made, tmp_path / "some.parquet")
     read = read_recordings(tmp_path / "some.parquet")
     for one, other in zip(made, read, strict=True):
         np.testing.assert_array_equal(one.flat, other.flat)
         assert vars(one) | {"actions": 0} == vars(other) | {"actions": 0}
+    old = pq.read_table(tmp_path / "some.parquet").drop_columns("clipped_steps")
+    pq.write_table(old, tmp_path / "old.parquet")
+    assert [one.clipped_steps for one in read_recordings(tmp_path / "old.parquet")] == [None, None]
     (tmp_path / "other.parquet").write_bytes(b"no parquet")
     with pytest.raises(InputError, match="cannot be read"):
         read_recordings(tmp_path / "other.parquet")
@@ -33,7 +39,7 @@ def test_an_array_that_its_caller_uses_again_is_recorded_as_it_was():
     recording, action = Recording(7), np.zeros(4, np.float32)
     for number in range(3):
         action[:] = number
-        recording.add(action, {"is_lifted": False, "is_in_bin": False, "is_success": False})
+        recording.add(action, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
     np.testing.assert_array_equal(recording.flat, np.repeat(np.float32([0, 1, 2]), 4))
 
 

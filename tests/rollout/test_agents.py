@@ -58,6 +58,17 @@ def test_a_policy_acts_in_the_precision_that_lerobots_evaluation_would_use(use_a
     assert policy.in_amp == use_amp
 
 
+def test_a_policy_that_reads_what_it_is_not_shown_is_told_which_observation_has_it():
+    policy = Sampling()
+    policy.select_action = lambda batch: batch["observation.images.wrist"]
+    with pytest.raises(InputError, match="reads observation.images.wrist.*obs_type=pixels_agent_pos") as refused:
+        PolicyAgent(policy, lambda batch: batch, lambda action: action).act(SEEN)
+    assert "\n" not in str(refused.value)
+    policy.select_action = lambda batch: {}["a fault of the policy's own"]
+    with pytest.raises(KeyError, match="of the policy's own"):
+        PolicyAgent(policy, lambda batch: batch, lambda action: action).act(SEEN)
+
+
 def test_an_adapter_is_no_policy(tmp_path):
     config = make_policy_config("act", device="cpu", use_peft=True, pretrained_backbone_weights=None)
     config.save_pretrained(tmp_path)

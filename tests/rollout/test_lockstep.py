@@ -154,18 +154,21 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
 
 
 def test_a_failing_agent_is_recorded_and_the_others_go_on():
-    hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
+    hover = Broken(np.array([0, 0, 0.5, GRIPPER_CLOSED], dtype=np.float32))
     agents = [Broken(None), hover, Broken(np.full(4, np.nan, dtype=np.float32))]
     failed, fine, refused = (outcome for _, outcome in sorted(roll_out(agents, ENV, SEEDS, n_workers=2)))
     assert "lost the plot" in str(failed.error) and failed.episodes == []
     assert "finite" in str(refused.error) and refused.episodes == []
     assert fine.error is None
     assert [(e.evaluation_seed, e.steps, e.stage) for e in fine.episodes] == [(s, STEPS, "none") for s in SEEDS]
+    assert [e.clipped_steps for e in fine.episodes] == [STEPS] * len(SEEDS), "it asks for 0.5 m a step"
 
 
 def step(**info):
     state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
-    return Step({}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False} | info)
+    return Step(
+        {}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0} | info
+    )
 
 
 def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():

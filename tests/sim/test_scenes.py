@@ -51,6 +51,53 @@ def seeing(request):
     env.close()
 
 
+WITHOUT_A_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU can")
+
+
+@pytest.mark.parametrize(
+    "asked, said",
+    [
+        ({"obs_mode": "state"}, None),
+        ({"obs_mode": "state_dict"}, None),
+        ({"obs_mode": "rgb"}, None),
+        ({"obs_mode": "rgb", "cameras": ("base", "wrist")}, None),
+        ({"obs_mode": "depth+segmentation"}, None),
+        ({"obs_mode": "pictures"}, "Invalid texture type 'pictures'"),
+        ({"reward_mode": "sparse"}, None),
+        ({"reward_mode": "none"}, None),
+        ({"reward_mode": "dense"}, "reward_mode must be sparse .* not 'dense'"),
+        ({"reward_mode": "normalized_dense"}, "reward_mode must be sparse"),
+        ({"control_mode": "pd_joint_delta_pos"}, None),
+        ({"control_mode": "pd_ee_delta_pos"}, None),
+        ({"control_mode": "metres"}, "metres not in supported modes: .*pd_ee_delta_pose"),
+        ({"robot_uids": "panda"}, None),
+        ({"render_mode": "rgb_array"}, None),
+        pytest.param({"num_envs": 4}, "physics on a GPU, and there is none", marks=WITHOUT_A_GPU),
+        pytest.param({"sim_backend": "gpu"}, "physics on a GPU, and there is none", marks=WITHOUT_A_GPU),
+        pytest.param({"render_mode": "human"}, "render_mode=human needs a display", marks=WITHOUT_A_GPU),
+    ],
+    ids=str,
+)
+def test_what_maniskills_users_ask_for_works_or_is_refused_in_one_sentence(asked, said):
+    def use():
+        env = gym.make(TASKS["brick_to_bin_turned"].env_id, **asked)
+        try:
+            seen, _ = env.reset(seed=0)
+            assert torch.is_tensor(seen) == (asked.get("obs_mode", "state") == "state")
+            _, reward, *_ = env.step(env.action_space.sample())
+            assert env.render_mode is None or env.render().shape[-1] == 3
+            return reward
+        finally:
+            env.close()
+
+    if said is None:
+        assert use() == 0
+        return
+    with pytest.raises(UserError, match=said) as refused:
+        use()
+    assert "\n" not in str(refused.value)
+
+
 def trajectory(env, seed, steps=12):
     rng = np.random.default_rng(seed)
     env.reset(seed=seed)
