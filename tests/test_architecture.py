@@ -22,7 +22,7 @@ ARROWS = {
     "lerobot_internals": (),
     "progress": (),
     "presets": (),
-    "tags": ("contract", "presets"),
+    "tags": ("presets",),
     "parsing": ("presets", "tags"),
     "contract": (),
     "artifacts": (),
@@ -32,7 +32,7 @@ ARROWS = {
     "envs": ("contract", "perturbations"),
     "envs.actions": ("contract",),
     "envs.recording": ("artifacts", "contract", "perturbations"),
-    "plugin": ("envs", "policies", "tags"),
+    "plugin": ("envs", "policies"),
     "demos": ("artifacts", "contract"),
     "demos.demonstrate": ("contract", "envs"),
     "demos.obtain": ("artifacts", "envs"),
@@ -85,6 +85,7 @@ ARROWS = {
         "rollout",
         "sim",
         "study",
+        "tags",
     ),
 }
 # Arrows of functions: the simulator is born on first use.

@@ -22,8 +22,7 @@ SHORT = {
     "constructskill-fit-noise": "--episodes=[1]",
     "constructskill-offline": "--episodes=[1]",
     "constructskill-study": "--only=fixed/no_op --seeds=1 --episodes=1",
-    "lerobot-train": "--dataset.episodes=[0,1] --dataset.eval_split=0.5 --eval_steps=0 --steps=2 --save_freq=2 "
-    "--batch_size=2 --num_workers=0",
+    "lerobot-train": "--steps=2 --save_freq=2 --batch_size=2 --num_workers=0",
     "lerobot-eval": "--env.episode_length=5 --eval.n_episodes=1",
 }
 """Command to the flags that shorten it."""
