@@ -67,10 +67,13 @@ ARROWS = {
     "analysis": (),
     "analysis.stats": ("study.rows",),
     "analysis.report": ("study.rows",),
+    "comparison": ("analysis.stats", "contract", "envs.recording", "perturbations", "study.rows"),
+    "comparison.evaluate": ("artifacts", "contract", "envs.recording", "rollout", "training"),
     "scripts": (
         "analysis",
         "artifacts",
         "board",
+        "comparison",
         "contract",
         "dagger",
         "dataset",

@@ -46,6 +46,7 @@ NOT_RUN = {
     "lerobot-eval --policy.path=outputs/smolvla": "needs its weights: tests/test_any_policy.py has random ones",
     "python examples/vla_evaluation_harness": "serves until it is killed: tests/test_vla_evaluation_harness.py",
     "PYTHONPATH=examples/vla_evaluation_harness": "asks that server",
+    "constructskill-compare 'outputs/mine": "needs seeds of the reader: tests/comparison/test_checkpoints.py",
     "constructskill-check-task --task=lintel_to_wall": "a task that the reader is to write: tests/test_check_task.py",
 }
 """How a printed command starts to why it is not run."""
