@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.artifacts.digests import distributions_of, versions
-from lerobot_constructskill.artifacts.processor import processor
-from lerobot_constructskill.comparison.sides import Conditions, Side, merge_versions
+from lerobot_constructskill.artifacts.processor import make, processor
+from lerobot_constructskill.comparison.sides import MAKER, Conditions, Side, merge_versions
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
@@ -46,7 +46,7 @@ def evaluate(
         for checkpoint, agent, rollout in _roll_out(group, env, starts, device):
             seeds.append({episode.evaluation_seed: episode.placed for episode in rollout.episodes})
             packages = versions(*ACTING, *distributions_of(type(agent.policy.config)))
-            told.append(packages | {"processor": processor(), "backend": rollout.backend})
+            told.append(packages | {"processor": processor(), MAKER: make(), "backend": rollout.backend})
             if kept_in is not None:
                 _keep(rollout, env, kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}")
     kind = f"{plural(len(checkpoints), 'checkpoint')}, evaluated now"

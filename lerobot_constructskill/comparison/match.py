@@ -43,7 +43,7 @@ class Comparison:
         a, b: the sides.
         conditions: where both were evaluated.
         starts: seeds of the episodes that both have, in order.
-        left_out: how many starts only one of them has.
+        n_starts: how many starts one of them has, or both.
         rates_a, rates_b: share of those episodes that placed, of each training seed; 0 for one that failed.
         judgement: the statistics.
     """
@@ -52,7 +52,7 @@ class Comparison:
     b: Side
     conditions: Conditions
     starts: list[int]
-    left_out: int
+    n_starts: int
     rates_a: list[float]
     rates_b: list[float]
     judgement: Judgement
@@ -82,9 +82,9 @@ def compare(a: Found, b: Found, asked: Asked, evaluate: Evaluate, alpha: float) 
 def judged(a: Side, b: Side, conditions: Conditions, starts: Sequence[int], alpha: float) -> Comparison:
     """The comparison of two sides on starts that both have."""
     rates = [[_rate(outcomes, starts) for outcomes in side.seeds] for side in (a, b)]
-    every = set.union(*(side.starts or set() for side in (a, b)))
+    either = set.union(*(side.starts or set() for side in (a, b)))
     judgement = judge(*map(np.array, rates), alpha)
-    return Comparison(a, b, conditions, list(starts), len(every - set(starts)), *rates, judgement)
+    return Comparison(a, b, conditions, list(starts), len(either), *rates, judgement)
 
 
 def _check_asked(a: Found, b: Found, asked: Asked) -> None:
@@ -133,8 +133,10 @@ def _starts_of(known: Sequence[Side], asked: Asked) -> list[int]:
         first = FIRST_START if asked.seed is None else asked.seed
         return list(range(first, first + (asked.episodes or EPISODES)))
     for side in known:
+        if side.starts is None:
+            raise InputError(f"Every training seed of '{side.name}' failed, so there is nothing to compare.")
         if not side.starts:
-            raise InputError(f"No training seed of '{side.name}' has an episode that all others of it have.")
+            raise InputError(f"The training seeds of '{side.name}' have no start in common.")
     common = sorted(set.intersection(*(side.starts for side in known)))
     if not common:
         told = " and ".join(f"'{side.name}' has {tell_starts(sorted(side.starts))}" for side in known)

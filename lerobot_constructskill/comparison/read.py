@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import yaml
 
-from lerobot_constructskill.comparison.sides import Conditions, Outcomes, Side, merge_versions, read_versions
+from lerobot_constructskill.comparison.sides import MAKER, Conditions, Outcomes, Side, merge_versions, read_versions
 from lerobot_constructskill.contract import LOOSE, SUITES
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, plural
@@ -82,8 +82,13 @@ def read_recorded(name: str, folders: Sequence[Path]) -> Side:
         kind=f"recordings of {plural(len(folders), 'training seed')}",
         env=envs[0],
         seeds=[_recorded(folder, recordings) for folder, recordings in by_folder.items()],
-        versions=merge_versions(read_versions(one.versions, backend=one.backend) for one in every),
+        versions=merge_versions(_versions_of(one) for one in every),
     )
+
+
+def _versions_of(recording: Recording) -> dict[str, str]:
+    told = read_versions(recording.versions, backend=recording.backend)
+    return {MAKER if name == "processor" else name: value for name, value in told.items()}
 
 
 def _recorded(folder: Path, recordings: list[Recording]) -> Outcomes:

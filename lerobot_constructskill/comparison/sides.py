@@ -97,6 +97,10 @@ def merge_versions(told: Iterable[Mapping[str, Any]]) -> dict[str, str]:
     return {name: ", ".join(values) for name, values in merged.items()}
 
 
+MAKER = "processor's maker"
+"""What recordings say of the processor, where a study's rows have its name."""
+
+
 def read_versions(text: str | None, **others: Any) -> dict[str, Any]:
     """The versions that a row or a recording has as JSON, and other facts of its making that are not None."""
     return json.loads(text or "{}") | {name: value for name, value in others.items() if value}

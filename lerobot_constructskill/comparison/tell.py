@@ -18,7 +18,7 @@ VERDICTS = {
     Verdict.BETTER: "A is better than B.",
     Verdict.WORSE: "A is worse than B.",
     Verdict.ALIKE: f"A and B are alike: they differ by less than {ALIKE_WITHIN * 100:.0f} points.",
-    Verdict.INCONCLUSIVE: "Which of them is better, so many seeds do not show.",
+    Verdict.INCONCLUSIVE: "So many seeds do not show which of them is better.",
 }
 
 
@@ -49,10 +49,10 @@ def _plain(value: Any) -> Any:
 
 def _sides(comparison: Comparison) -> str:
     lines = [f"{letter}  {side.name}: {side.kind}" for letter, side in (("A", comparison.a), ("B", comparison.b))]
-    starts = f"{tell_starts(comparison.starts)} ({len(comparison.starts)})"
-    if comparison.left_out:
-        starts += f"; {plural(comparison.left_out, 'start')} of one side alone left out"
-    lines.append(f"in {comparison.conditions}; {starts}")
+    n = f"{len(comparison.starts)}"
+    if comparison.n_starts > len(comparison.starts):
+        n += f" of the {comparison.n_starts} that one side has"
+    lines.append(f"in {comparison.conditions}; {tell_starts(comparison.starts)} ({n})")
     for letter, side in (("A", comparison.a), ("B", comparison.b)):
         if side.env is None:
             lines.append(f"lerobot-eval does not write where it evaluated: of {letter} that is assumed")

@@ -10,7 +10,7 @@ from lerobot_constructskill.comparison import match
 from lerobot_constructskill.comparison.find import find
 from lerobot_constructskill.comparison.sides import Side
 from lerobot_constructskill.envs.recording import Recording
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, TakenError
 from lerobot_constructskill.scripts import compare as script
 from lerobot_constructskill.scripts.compare import FAILED, CompareConfig, compare
 
@@ -67,7 +67,7 @@ def test_two_spellings_of_a_perturbation_are_one(study, recorded):
 def test_starts_are_those_in_common(study):
     whole, later = study(GOOD), study(GOOD, "later", starts=range(1008, 1018))
     comparison = compared(whole, later)
-    assert (comparison.starts, comparison.left_out) == ([1008, 1009], 16)
+    assert (comparison.starts, comparison.n_starts) == ([1008, 1009], 18)
     assert comparison.rates_a == [1.0, 1.0, 0.5, 1.0, 1.0]
     with pytest.raises(InputError, match="no start in common: .* starts 1000 to 1009 and .* starts 2000 to 2004"):
         compared(whole, study(GOOD, "elsewhere", starts=range(2000, 2005)))
@@ -118,6 +118,12 @@ def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
             compared(text, published)
     with pytest.raises(InputError, match="is both sides"):
         compared(published, published)
+    with pytest.raises(InputError, match="Every training seed of '.*' failed, so there is nothing"):
+        compared(published, study([None, None], "failed"))
+    with pytest.raises(InputError, match="No run of 'block/ours' in '.*' has been made"):
+        compared(published, study([-1], "missing"))
+    with pytest.raises(TakenError, match="exists already"):
+        compare(CompareConfig(published, study(BAD, "b"), out=tmp_path))
 
 
 def test_damaged_files_are_one_sentence(study, evaluated, recorded, tmp_path):
@@ -146,7 +152,8 @@ def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, 
     assert "Both were made with lerobot 0.6.1; processor a CPU." in told
     one = compare(CompareConfig(recorded(GOOD[:1]), study(BAD[:1])))
     assert "One training seed a side tells how these two checkpoints do, and nothing of their policies" in one
-    assert "so many seeds do not show" in one
+    assert "So many seeds do not show which of them is better." in one
+    assert "They differ in torch (" in one and "B alone tells lerobot 0.6.1; processor a CPU." in one
     few = compare(CompareConfig(evaluated(GOOD[:3]), study(BAD[:3], "few"), seed=1000))
     assert "3 and 3 seeds can show no difference, however large: their p-value is at least 0.10." in few
     assert "does not write where it evaluated: of A that is assumed" in few and "B alone tells lerobot 0.6.1" in few
@@ -171,7 +178,7 @@ def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys
         except SystemExit as ended:
             found = ended.code
         out = capsys.readouterr().out
-        assert found == status and ("than B." in out or "do not show" in out) == (status != 1), (flags, out)
+        assert found == status and ("than B." in out or "do not show which" in out) == (status != 1), (flags, out)
 
 
 def test_every_number_is_in_a_file(study, tmp_path):
