@@ -2,19 +2,24 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 
 from lerobot_constructskill.analysis.stats.comparisons import Verdict
 from lerobot_constructskill.comparison import match
 from lerobot_constructskill.comparison.find import find
+from lerobot_constructskill.comparison.read import read_study
 from lerobot_constructskill.comparison.sides import Side
+from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.recording import Recording
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
 from lerobot_constructskill.scripts import compare as script
 from lerobot_constructskill.scripts.compare import FAILED, CompareConfig, compare
+from lerobot_constructskill.study.rows import read_rows
 
 ENV = {"task": "block_to_bin", "episode_length": 5, "obs_type": "pixels_agent_pos"}
+RESULTS = Path(__file__).parents[2] / "results"
 GOOD, BAD = [10, 10, 9, 10, 10], [1, 0, 2, 0, 1]
 
 
@@ -35,6 +40,13 @@ def test_a_study_is_compared_with_recordings_and_results_of_lerobot_eval(study, 
         assert comparison.rates_a == [count / 10 for count in GOOD]
         assert comparison.rates_b == [count / 10 for count in BAD]
         assert compared(published, other, **asked).judgement.verdict is Verdict.WORSE
+
+
+def test_every_published_study_has_a_variant_that_can_be_compared_with():
+    for folder in RESULTS.glob("*/"):
+        arms = read_rows(folder / "rows.parquet").query("role == 'variant' and placed.notna()")
+        side = read_study(folder, f"{arms['setting'].iloc[0]}/{arms['variant'].iloc[0]}")
+        assert side.conditions.task in TASKS and side.starts and "lerobot" in side.versions, folder
 
 
 def test_a_failed_training_seed_counts_as_one_that_did_not_place_and_a_missing_one_not_at_all(study):
