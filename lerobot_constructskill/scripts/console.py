@@ -52,7 +52,12 @@ def run[Config](
 
 def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
     """Put the names of fields before values that come before all flags."""
-    values = list(takewhile(lambda flag: not flag.startswith("-"), flags[: len(first)]))
+    values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
+    if len(values) > len(first):
+        raise InputError(
+            f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
+            "marks, so that the shell leaves it alone."
+        )
     return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *flags[len(values) :]]
 
 

@@ -189,7 +189,8 @@ def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys
             found = 0
         except SystemExit as ended:
             found = ended.code
-        out = capsys.readouterr().out
+        out, said = capsys.readouterr()
+        assert ("put a pattern in quotation marks" in said) == ("third" in flags)
         assert found == status and ("than B." in out or "do not show which" in out) == (status != 1), (flags, out)
 
 
