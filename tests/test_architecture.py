@@ -106,6 +106,7 @@ EXTERNALS = {
     "perturbations": set(),
     "artifacts": {"ray"},
     "board": {"huggingface_hub", "jinja2", "markupsafe", "numpy", "pyarrow", "yaml"},
+    "comparison": {"numpy", "pandas", "yaml"},
     "analysis": set(),
     "analysis.stats": {"numpy", "pandas", "scipy", "statsmodels"},
     "analysis.report": {"PIL", "draccus", "jinja2", "markupsafe", "matplotlib", "numpy", "pandas", "yaml"},
