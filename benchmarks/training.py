@@ -5,6 +5,8 @@ import shutil
 
 from measure import LOG, OUT, report, run
 
+from lerobot_constructskill.scripts.config import TrainingFile, write
+
 RECIPE_SAMPLES = 150 * 7252
 """What one seed of the recipe sees: 150 passes over the 70 demonstrations of the fast set that are not held out."""
 
@@ -19,7 +21,6 @@ VIDEO = [
     f"--dataset.root={OUT}/demonstrations",
     "--policy.backbone_precision=float32",
 ]
-FEATURES = ["--config_path=configs/train/frozen_vit_fast.yaml", f"--dataset.root={OUT}/features"]
 COMMON = ["--policy.push_to_hub=false", "--policy.save_backbone=false", "--env_eval_freq=0", "--log_freq=1"]
 
 
@@ -43,7 +44,8 @@ def train(number: int, steps: int, *flags: str) -> tuple[float, float]:
 
 def main() -> None:
     video_seconds, video_rate = train(0, VIDEO_STEPS, *VIDEO, "--num_workers=0")
-    stock = [train(seed, STEPS, *FEATURES, f"--seed={seed}") for seed in range(1, 1 + STOCK_RUNS)]
+    features = f"--config_path={write(TrainingFile('frozen_vit_fast', OUT / 'features'))}"
+    stock = [train(seed, STEPS, features, f"--seed={seed}") for seed in range(1, 1 + STOCK_RUNS)]
     feature_rate = sum(rate for _, rate in stock) / STOCK_RUNS
     what = "training samples/s under stock lerobot-train"
     report(what, feature_rate, "the same policy on video, float32", video_rate, 50, "once they run, start-up left out")

@@ -32,9 +32,7 @@ say "Features: every frame once through the frozen DINOv2 encoder"
 [ -d "$OUT/features" ] || constructskill-encode --camera=wrist --patches=true \
     --repo_id=local/shifted --root="$OUT/demonstrations" --out_repo_id=local/shifted_dinov2 --out_root="$OUT/features"
 
-# The recipe is for 80 demonstrations: as many passes over these 50, of which every eighth is held out as well.
-recipe=$(constructskill-config train/frozen_vit_keypoints) steps=900
-episodes=$(python -c "from lerobot_constructskill.contract import held_out_last; print(held_out_last(50))")
+recipe=$(constructskill-config train/frozen_vit_keypoints --root="$OUT/features")
 for seed in $SEEDS; do
     train="$OUT/train/seed_$seed" eval="$OUT/eval/seed_$seed"
     if [ ! -e "$train/checkpoints/last" ]; then
@@ -42,8 +40,7 @@ for seed in $SEEDS; do
         rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
         # One thread: more would stall the two processes that load, on a machine with few cores.
         OMP_NUM_THREADS=1 with_bar "$OUT/train_$seed.log" lerobot-train --config_path="$recipe" \
-            --dataset.root="$OUT/features" --dataset.episodes="$episodes" --dataset.eval_split=0.12 \
-            --steps=$steps --save_freq=$steps --eval_steps=$steps --seed="$seed" --output_dir="$train"
+            --seed="$seed" --output_dir="$train"
     fi
     if [ ! -e "$eval/eval_info.json" ]; then
         say "Training seed $seed: lerobot-eval, 5 episodes of at most 250 steps"

@@ -33,8 +33,7 @@ NAMES = {
     "CosineAnnealingWithWarmupSchedulerConfig": "lerobot.optim.schedulers",
     "TrainPipelineConfig": "lerobot.configs.train",
     "register_third_party_plugins": "lerobot.utils.import_utils",
-    # Of draccus, by which LeRobot reads its configurations: the loader of YAML files, and the parser of flags.
-    "FullLoaderWithInclusion": "draccus.parsers.yaml_loader",
+    # Of draccus, by which LeRobot reads its configurations: the parser of flags.
     "ArgumentParser": "draccus.argparsing",
 }
 """The modules that hold them."""

@@ -1,7 +1,9 @@
 """Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
 
+import argparse
 import json
 import shlex
+import tempfile
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,7 +13,7 @@ from typing import Any
 import draccus
 import yaml
 
-from lerobot_constructskill import tags  # noqa: F401
+from lerobot_constructskill import tags
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find
@@ -31,10 +33,12 @@ def parse[Config](
 
     Raises:
         InputError: they do not make a configuration.
+        MissingError: a `!policy` in the file names no shipped policy.
         OSError: the file cannot be opened.
     """
-    with as_input():
-        parser = ArgumentParser(config_class, config_path, exit_on_error=False, epilog=epilog)
+    named, flags = _take_config_path(flags)
+    with as_input(), _plain(named or config_path) as file:
+        parser = ArgumentParser(config_class, file, exit_on_error=False, epilog=epilog)
         return parser.parse_args([_readable(flag) for flag in flags])
 
 
@@ -53,6 +57,27 @@ def parse_named[Config](config_class: type[Config], kind: str, text: str, flags:
     with as_input():
         name, *own = shlex.split(text) or [""]
     return parse(config_class, [*flags, *own], find(kind, name))
+
+
+def _take_config_path(flags: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The value of `--config_path`, and the other flags."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument("--config_path")
+    with as_input():
+        taken, others = parser.parse_known_args(flags)
+    return taken.config_path, others
+
+
+@contextmanager
+def _plain(path: Path | str | None) -> Iterator[Path | str | None]:
+    """A configuration file as draccus can read it: without our tags. JSON and TOML have none."""
+    if path is None or Path(path).suffix in (".json", ".toml"):
+        yield path
+        return
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
+        yaml.safe_dump(tags.read(path), file, sort_keys=False, allow_unicode=True)
+        file.flush()
+        yield file.name
 
 
 def _readable(flag: str) -> str:

@@ -18,6 +18,17 @@ def names(kind: str) -> list[str]:
     return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
 
 
+def named(kind: str, name: str) -> Path:
+    """The file of a shipped configuration.
+
+    Raises:
+        MissingError: there is no such name.
+    """
+    if name not in names(kind):
+        raise MissingError(f"There is no {kind} configuration '{name}'; {_listed(kind)}")
+    return FOLDER / kind / f"{name}.yaml"
+
+
 def find(kind: str, name_or_path: str | Path) -> Path:
     """The file of a shipped configuration, or the file that was given; a name wins over a file called like it.
 
@@ -26,12 +37,14 @@ def find(kind: str, name_or_path: str | Path) -> Path:
     """
     name = str(name_or_path)
     if name in names(kind):
-        return FOLDER / kind / f"{name}.yaml"
+        return named(kind, name)
     if Path(name).is_file():
         return Path(name)
-    raise MissingError(
-        f"There is no file and no {kind} configuration '{name}'; the configurations are: {', '.join(names(kind))}."
-    )
+    raise MissingError(f"There is no file and no {kind} configuration '{name}'; {_listed(kind)}")
+
+
+def _listed(kind: str) -> str:
+    return f"the configurations are: {', '.join(names(kind))}."
 
 
 def description(path: Path) -> str:

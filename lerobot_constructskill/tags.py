@@ -1,25 +1,23 @@
-"""What two tags mean in YAML files, for LeRobot's own commands and for ours.
+"""The YAML of our own configuration files, in which `!policy` stands for the fields of a shipped policy.
 
-`!held_out_last 80` is episodes 0 to 79 with the held-out ones last, which is where LeRobot's `dataset.eval_split`
-takes its part. `!policy precise` is the fields of `configs/policy/precise.yaml`; `!policy {preset: precise, camera:
-base}` is the same with another value.
+`!policy precise` is the fields of `configs/policy/precise.yaml`; `!policy {preset: precise, camera: base}` is the same
+with another value. The tag has a meaning for `Loader` alone: PyYAML's own loaders refuse it, as they always do.
 """
 
+from pathlib import Path
 from typing import Any
 
 import yaml
 
-from lerobot_constructskill.contract import held_out_last
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.lerobot_internals import FullLoaderWithInclusion
-from lerobot_constructskill.presets import find
+from lerobot_constructskill.presets import named
 
 
-def _held_out_last(loader: yaml.SafeLoader, node: yaml.Node) -> list[int]:
-    return held_out_last(int(loader.construct_scalar(node)))
+class Loader(yaml.SafeLoader):
+    """PyYAML's safe loader with `!policy`, which takes names of shipped policies and opens no other file."""
 
 
-def _policy(loader: yaml.SafeLoader, node: yaml.Node) -> dict[str, Any]:
+def _policy(loader: Loader, node: yaml.Node) -> dict[str, Any]:
     if isinstance(node, yaml.ScalarNode):
         name, fields = node.value, {}
     else:
@@ -27,10 +25,20 @@ def _policy(loader: yaml.SafeLoader, node: yaml.Node) -> dict[str, Any]:
         if "preset" not in fields:
             raise InputError("`!policy {…}` must name the policy that it starts from, such as `preset: precise`.")
         name = fields.pop("preset")
-    return yaml.safe_load(find("policy", name).read_text()) | fields
+    return yaml.safe_load(named("policy", str(name)).read_text()) | fields
 
 
-# LeRobot reads a file by the first loader to look for `policy.path`, and by the second to parse it.
-for _loader in (yaml.SafeLoader, FullLoaderWithInclusion):
-    _loader.add_constructor("!held_out_last", _held_out_last)
-    _loader.add_constructor("!policy", _policy)
+Loader.add_constructor("!policy", _policy)
+
+
+def read(path: Path | str) -> Any:
+    """The content of a configuration file as plain values.
+
+    Raises:
+        OSError: the file cannot be opened.
+        MissingError: a `!policy` in it names no shipped policy.
+        InputError: a `!policy` in it names none at all.
+        yaml.YAMLError: it is no YAML.
+    """
+    with open(path, encoding="utf-8") as file:
+        return yaml.load(file, Loader)

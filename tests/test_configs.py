@@ -9,21 +9,24 @@ import draccus
 import lerobot.policies  # noqa: F401  registers the policies
 import pytest
 import yaml
+from draccus.parsers.yaml_loader import FullLoaderWithInclusion
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig, parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.optim import AdamWConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
+from metadata import write_metadata
 
 import lerobot_constructskill.plugin  # noqa: F401
-from lerobot_constructskill import presets
+from lerobot_constructskill import presets, tags
 from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
+from lerobot_constructskill.scripts.config import TrainingFile, write
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.rows import VARIANT
 from lerobot_constructskill.study.runs import list_runs
@@ -36,7 +39,7 @@ SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
 PRECISE = sorted((CONFIGS / "generate" / "precise").glob("*.yaml"))
 POLICIES = sorted((CONFIGS / "policy").glob("*.yaml"))
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
-TRAIN = sorted((CONFIGS / "train").glob("*.yaml"))
+TRAIN = presets.names("train")
 
 
 def generate_config(path: Path) -> GenerateConfig:
@@ -81,13 +84,13 @@ def test_executed_labels_differ_from_fast_in_the_labels_alone():
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_a_study_is_runs_that_can_be_made(path):
     """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
-    for run in list_runs(draccus.parse(StudyConfig, path, args=[]).study):
+    for run in list_runs(parse(StudyConfig, [], path).study):
         assert all(run.arm.env["task"] == data.config.task for data in run.arm.validated_on)
 
 
 @pytest.mark.parametrize("name", ["perturbed", "perturbed_paper"])
 def test_a_perturbed_study_has_every_level_of_every_axis_beside_the_task_as_it_is(name):
-    study = draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[])
+    study = parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml")
     sweeps = {axis: ["control", *(f"{axis}_{level + 1}" for level in range(len(AXES[axis].levels)))] for axis in AXES}
     assert study.analysis.sweeps == sweeps
     control = study.settings.pop("control")
@@ -99,7 +102,7 @@ def test_a_perturbed_study_has_every_level_of_every_axis_beside_the_task_as_it_i
 @pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
 def test_no_two_sets_of_a_setting_are_one(path):
     """A flag over a set that changes nothing would compare a policy with itself."""
-    study = draccus.parse(StudyConfig, path, args=[]).study
+    study = parse(StudyConfig, [], path).study
     for setting in study.settings:
         configs = [
             parse_named(GenerateConfig, "generate", data, ["--repo_id=local/set"]) for data in study.data_of(setting)
@@ -108,7 +111,7 @@ def test_no_two_sets_of_a_setting_are_one(path):
 
 
 def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
-    study = draccus.parse(StudyConfig, CONFIGS / "study" / "precise_parts.yaml", args=[]).study
+    study = parse(StudyConfig, [], CONFIGS / "study" / "precise_parts.yaml").study
     sets = {run.arm.name: run.arm.demonstrations.config for run in list_runs(study)}
     precise, av1, quiet = (sets[name] for name in ("precise", "av1_video", "quiet_release"))
     assert replace(av1, video="lossless") == precise != av1
@@ -116,7 +119,7 @@ def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
 
 
 def test_the_dose_response_is_six_doses_of_one_set():
-    study = draccus.parse(StudyConfig, CONFIGS / "study" / "dart_dagger.yaml", args=[]).study
+    study = parse(StudyConfig, [], CONFIGS / "study" / "dart_dagger.yaml").study
     runs = [run for run in list_runs(study) if run.arm.setting == "frames_4k" and run.arm.demonstrations]
     sets = {run.arm.name: run.arm.demonstrations.config for run in runs}
     doses = {0: "clean", 10: "fixed"} | {millimetres: f"sigma_{millimetres}mm" for millimetres in (2, 5, 20, 30)}
@@ -127,7 +130,7 @@ def test_the_dose_response_is_six_doses_of_one_set():
 
 def test_the_papers_study_holds_its_52_runs():
     """Ten seeds of four backbones, three of four ablations; the study has more seeds of some."""
-    config = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[])
+    config = parse(StudyConfig, [], CONFIGS / "study" / "paper.yaml")
     assert all(variant.seeds >= 10 for variant in config.study.variants.values())
     policies = {name: variant.policy for name, variant in config.study.variants.items()}
     backbones = {name for name, spec in BACKBONES.items() if spec.repo_id}
@@ -148,7 +151,7 @@ def test_the_papers_study_holds_its_52_runs():
 
 def test_the_papers_recipe_is_the_papers():
     """Spec, sections 4 and 5: what paper.yaml leaves to defaults, as numbers of their own."""
-    config = draccus.parse(StudyConfig, CONFIGS / "study" / "paper.yaml", args=[])
+    config = parse(StudyConfig, [], CONFIGS / "study" / "paper.yaml")
     arms = {run.arm.name: run.arm for run in list_runs(config.study) if run.arm.role == VARIANT}
     for name in arms.keys() - {"converged"}:
         policy, optimizer = arms[name].policy, arms[name].policy.get_optimizer_preset()
@@ -159,7 +162,7 @@ def test_the_papers_recipe_is_the_papers():
 
 def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():
     precise, ladder = (
-        draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[]).study for name in ("precise", "ladder")
+        parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study for name in ("precise", "ladder")
     )
     assert (ladder.variants, ladder.training) == (precise.variants, precise.training)
     for name, setting in SUITES["ladder"].settings.items():
@@ -171,7 +174,7 @@ def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():
 
 def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites():
     precise, parts, suite = (
-        draccus.parse(StudyConfig, CONFIGS / "study" / f"{name}.yaml", args=[]).study
+        parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study
         for name in ("precise", "precise_parts", "suite")
     )
     whole, before = (study.variants[name].policy for study, name in ((parts, "precise"), (parts, "as_before")))
@@ -207,7 +210,7 @@ def test_a_policy_is_named_in_a_file_that_lies_anywhere(path, study_of):
 
 
 def test_a_policy_that_is_not_there_is_refused_with_those_that_are(study_of):
-    with pytest.raises(InputError, match="no policy configuration 'exact'; the configurations are: .*precise"):
+    with pytest.raises(MissingError, match="no policy configuration 'exact'; the configurations are: .*precise"):
         study_of("!policy exact")
     with pytest.raises(InputError, match="such as `preset: precise`"):
         study_of("!policy {camera: base}")
@@ -216,7 +219,7 @@ def test_a_policy_that_is_not_there_is_refused_with_those_that_are(study_of):
 
 
 def test_cut_to_fewer_seeds_every_variant_and_reference_has_them():
-    cut = draccus.parse(StudyConfig, CONFIGS / "study" / "dense.yaml", args=["--seeds=4"]).study
+    cut = parse(StudyConfig, ["--seeds=4"], CONFIGS / "study" / "dense.yaml").study
     assert {variant.seeds for variant in cut.variants.values()} == {4} and max(cut.references.values()) == 4
 
 
@@ -242,14 +245,95 @@ def train_config(monkeypatch):
     return read
 
 
-@pytest.mark.parametrize("path", TRAIN, ids=lambda path: path.stem)
-def test_training_configs_hold_out_every_eighth_episode_and_no_other(path, train_config):
-    config = train_config(path)
-    episodes = config.dataset.episodes
-    n_held_out = math.ceil(len(episodes) * config.dataset.eval_split)
-    assert sorted(episodes) == list(range(80)) and episodes == held_out_last(80)
-    assert episodes[-n_held_out:] == [i for i in range(80) if i % 8 == 7] == held_out(80)
-    assert config.eval_steps and config.steps % config.eval_steps == 0
+@pytest.fixture
+def written(tmp_path):
+    """Write a configuration of training for a set of n demonstrations of 104 frames."""
+
+    def write_for(name: str, n: int = 80, **options) -> Path:
+        root = tmp_path / f"set_{n}"
+        return write(TrainingFile(name, root if root.exists() else write_metadata(root, [104] * n), **options))
+
+    return write_for
+
+
+@pytest.mark.parametrize("name", TRAIN)
+@pytest.mark.parametrize("n", [2, 100])
+def test_training_holds_out_every_eighth_episode_and_no_other(name, n, written, train_config, tmp_path):
+    config = train_config(written(name, n), f"--output_dir={tmp_path / 'out'}")
+    assert config.dataset.root == str(tmp_path / f"set_{n}") and config.dataset.episodes == held_out_last(n)
+    assert math.ceil(n * config.dataset.eval_split) == len(held_out(n))
+    assert bool(config.eval_steps) == (n >= 8) and config.steps % config.save_freq == 0
+
+
+STEPS = {
+    "act": 100_000,
+    "diffusion": 20_000,
+    "frozen_vit_fast": 1140,
+    "frozen_vit_keypoints": 1428,
+    "pi0": 3000,
+    "pi05": 3000,
+    "smolvla": 20_000,
+}
+"""What 80 demonstrations of the everyday sets are trained for."""
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_eighty_demonstrations_are_trained_as_long_as_before(name, written):
+    fields = yaml.safe_load(written(name).read_text())
+    assert fields["steps"] == pytest.approx(STEPS[name], rel=0.05)
+
+
+def test_passes_are_counted_in_frames_that_are_trained_on(written):
+    fields = yaml.safe_load(written("frozen_vit_fast", n=16, passes=7).read_text())
+    assert fields["steps"] == fields["save_freq"] == 7 * math.ceil(14 * 104 / 64)
+    often = yaml.safe_load(written("act", n=16, passes=8).read_text())
+    assert often["steps"] == 8 * 14 * 104 / 8 == 4 * often["save_freq"], "five checkpoints are not equally far apart"
+
+
+@pytest.mark.parametrize("name", TRAIN)
+def test_what_is_written_is_plain_yaml_with_every_field_of_the_policy(name, written, tmp_path):
+    file = written(name, out=tmp_path / "mine" / "file.yaml")
+    template, fields = tags.read(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
+    assert file == tmp_path / "mine" / "file.yaml" and fields["policy"] == template["policy"]
+    assert not {"passes", "checkpoints"} & fields.keys()
+
+
+def test_a_file_lies_beside_its_set_and_says_of_which_it_is(written, tmp_path):
+    small, large = written("act", n=7), written("act", n=8)
+    assert (small, large) == (tmp_path / "set_7_act.yaml", tmp_path / "set_8_act.yaml")
+    assert "7 demonstrations, too few for every eighth to be held out" in small.read_text()
+    assert f"{tmp_path / 'set_8'}: 8 demonstrations, 1 of them held out; 110 passes." in large.read_text()
+
+
+def test_a_set_in_lerobots_cache_or_on_the_hub_is_named_alone(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "lerobot_constructskill.dataset.hub.locate", lambda *_: write_metadata(tmp_path / "c", [9] * 8)
+    )
+    file = write(TrainingFile("act", repo_id="alice/bricks"))
+    dataset = yaml.safe_load(file.read_text())["dataset"]
+    assert file == Path("outputs/bricks_act.yaml") and dataset["repo_id"] == "alice/bricks" and "root" not in dataset
+
+
+def test_training_is_written_for_a_set_alone():
+    with pytest.raises(InputError, match="train/act is written for a data set: add --root=FOLDER"):
+        TrainingFile("act")
+    with pytest.raises(MissingError, match="no train configuration 'atc'; the configurations are: act, "):
+        TrainingFile("atc", Path("anywhere"))
+
+
+def test_the_tag_has_no_meaning_for_others():
+    """LeRobot, and whoever imports the plugin, reads YAML of strangers."""
+    for loader in yaml.SafeLoader, yaml.FullLoader, FullLoaderWithInclusion:
+        with pytest.raises(yaml.constructor.ConstructorError, match="the tag '!policy'"):
+            yaml.load("x: !policy keypoints", loader)
+
+
+def test_the_tag_opens_no_file(tmp_path, study_of):
+    secret = tmp_path / "secret.yaml"
+    secret.write_text("type: frozen_vit")
+    with pytest.raises(MissingError, match="There is no policy configuration"):
+        study_of(f"!policy {secret}")
 
 
 PUBLISHED = {
@@ -272,10 +356,10 @@ def published(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["act", "diffusion", *PUBLISHED])
-def test_other_policies_accept_our_features_under_the_names_they_know(kind, train_config, tmp_path):
+def test_other_policies_accept_our_features_under_the_names_they_know(kind, written, train_config, tmp_path):
     """As far as pi0 and pi0.5 are tested here: their 3 billion parameters are never built."""
     base = [f"--policy.path={published(kind, tmp_path)}"] if kind in PUBLISHED else []
-    config = train_config(CONFIGS / "train" / f"{kind}.yaml", f"--output_dir={tmp_path / 'out'}", *base)
+    config = train_config(written(kind), f"--output_dir={tmp_path / 'out'}", *base)
     config.validate()
     policy, task = config.policy, get_task("brick_to_bin")
     columns = demonstration_features(task, "pixels_agent_pos")

@@ -33,6 +33,8 @@ NEEDED = {
     "out": "out.yaml",
     "suite": "bins",
     "about": "about.yaml",
+    "a": "one",
+    "b": "another",
 }
 """Something valid for each field without a default."""
 

@@ -103,7 +103,7 @@ def test_one_command_lists_the_others_and_starts_them() -> None:
     listed = front().stdout
     assert all(f"\n  {name.removeprefix('constructskill-')} " in listed for name in PROJECT["scripts"] if "-" in name)
     assert front("--version").stdout.startswith(f"constructskill {PROJECT['version']} (Python ")
-    assert front("config", "train/act").stdout == f"{show('train/act')}\n"
+    assert front("config", "study/paper").stdout == f"{show('study/paper')}\n"
     assert front("generate", "fsat").stderr.startswith("constructskill-generate: There is no file and no")
     unknown = front("genrate")
     assert unknown.returncode == 1 and "'genrate'; the commands are: board, " in unknown.stderr
@@ -138,8 +138,8 @@ def test_an_installed_copy_finds_its_configurations_from_an_empty_folder(built: 
     surroundings = os.environ | {"PYTHONPATH": str(installed)}
     done = subprocess.run(command, env=surroundings, cwd=elsewhere, capture_output=True, text=True)
     assert done.stdout.rstrip() == show(), done.stderr
-    one = subprocess.run([*command, "train/act"], env=surroundings, cwd=elsewhere, capture_output=True, text=True)
-    assert one.stdout.strip() == str(installed / "lerobot_constructskill" / "configs" / "train" / "act.yaml")
+    one = subprocess.run([*command, "study/act"], env=surroundings, cwd=elsewhere, capture_output=True, text=True)
+    assert one.stdout.strip() == str(installed / "lerobot_constructskill" / "configs" / "study" / "act.yaml")
     assert presets.FOLDER == REPOSITORY / "configs", "a checkout reads its own files"
 
 
@@ -148,7 +148,7 @@ def test_every_configuration_has_a_name_and_says_what_it_is() -> None:
     assert named == set((REPOSITORY / "configs").rglob("*.yaml"))
     lines = show().splitlines()
     assert len(lines) == len(named) and all(len(line.split()) > 3 for line in lines)
-    assert show("train/act") == str(REPOSITORY / "configs" / "train" / "act.yaml")
+    assert show("study/act") == str(REPOSITORY / "configs" / "study" / "act.yaml")
 
 
 def test_a_name_wins_over_a_file_called_like_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

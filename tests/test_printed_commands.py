@@ -21,8 +21,7 @@ SHORT = {
     "constructskill-fit-noise": "--episodes=[1]",
     "constructskill-offline": "--episodes=[1]",
     "constructskill-study": "--only=fixed/no_op --seeds=1 --episodes=1",
-    "lerobot-train": "--dataset.episodes=[0,1] --dataset.eval_split=0.5 --eval_steps=0 --steps=2 --save_freq=2 "
-    "--batch_size=2 --num_workers=0",
+    "lerobot-train": "--steps=2 --save_freq=2 --batch_size=2 --num_workers=0",
     "lerobot-eval": "--env.episode_length=5 --eval.n_episodes=1",
 }
 """Command to the flags that shorten it."""
@@ -46,6 +45,7 @@ NOT_RUN = {
     "lerobot-eval --policy.path=outputs/smolvla": "needs its weights: tests/test_any_policy.py has random ones",
     "python examples/vla_evaluation_harness": "serves until it is killed: tests/test_vla_evaluation_harness.py",
     "PYTHONPATH=examples/vla_evaluation_harness": "asks that server",
+    "constructskill-compare 'outputs/mine": "needs seeds of the reader: tests/comparison/test_checkpoints.py",
     "constructskill-check-task --task=lintel_to_wall": "a task of the reader's: tests/test_other_packages.py",
 }
 """How a printed command starts to why it is not run."""

@@ -7,16 +7,19 @@ import sys
 import tomllib
 from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
+from metadata import write_metadata
 from printed import PAGES, ROOT, commands, spans
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.presets import find
+from lerobot_constructskill.scripts.config import TrainingFile, write
 
 OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 THEIRS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
@@ -44,18 +47,30 @@ def parsing_alone(monkeypatch) -> None:
     parse = argparse.ArgumentParser.parse_known_args
 
     def stop(self, *args, **kwargs):
+        if not self.add_help:  # it takes --config_path out for the command's own parser
+            return parse(self, *args, **kwargs)
         raise ParsedError(*parse(self, *args, **kwargs)[1])
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_known_args", stop)
 
 
-def words(command: str) -> list[str]:
+def words(command: str, folder: Path) -> list[str]:
     """The command as its process gets it."""
     for printed, put in STAND_INS.items():
         command = command.replace(printed, put)
     return shlex.split(
-        re.sub(r"\$\(constructskill-config (\w+)/(\w+)\)", lambda name: str(find(*name.groups())), command)
+        re.sub(r"\$\((constructskill-config [^)]*)\)", lambda call: configured(call[1], folder), command)
     )
+
+
+def configured(call: str, folder: Path) -> str:
+    """The file that a call of constructskill-config names, for a set of the test's own."""
+    _, name, *flags = shlex.split(call)
+    kind, _, name = name.partition("/")
+    if kind != "train":
+        return str(find(kind, name))
+    assert [flag.partition("=")[0] for flag in flags] == ["--root"]
+    return str(write(TrainingFile(name, write_metadata(folder / "set", [100] * 9))))
 
 
 def entry_point(name: str) -> Callable[[], None]:
@@ -64,16 +79,16 @@ def entry_point(name: str) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in OURS])
-def test_flags_of_ours_are_known(command: str, parsing_alone, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", words(command))
+def test_flags_of_ours_are_known(command: str, parsing_alone, monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(sys, "argv", words(command, tmp_path))
     with pytest.raises(ParsedError) as parsed:
         entry_point(sys.argv[0])()
     assert parsed.value.args == ()
 
 
 @pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in THEIRS])
-def test_fields_of_lerobots_are_known(command: str, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "argv", words(command))
+def test_fields_of_lerobots_are_known(command: str, monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(sys, "argv", words(command, tmp_path))
     checkpoint = FrozenViTChunkConfig(device="cpu")  # in place of one that an earlier command makes
     monkeypatch.setattr(PreTrainedConfig, "from_pretrained", lambda *_, **__: checkpoint)
 

@@ -6,9 +6,10 @@ import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from itertools import takewhile
 from pathlib import Path
 from typing import NoReturn
 
@@ -29,18 +30,35 @@ class Parser(argparse.ArgumentParser):
         raise InputError(message)
 
 
-def run[Config](config_class: type[Config], action: Callable[[Config], str], presets: str | None = None) -> None:
+def run[Config](
+    config_class: type[Config],
+    action: Callable[[Config], str],
+    presets: str | None = None,
+    first: Sequence[str] = (),
+) -> None:
     """Parse `config_class` from the command line and print what `action` returns, inside `edge`.
 
-    Where `presets` is a kind of shipped configurations, one of them, or a file, can stand before all flags.
+    Where `presets` is a kind of shipped configurations, one of them, or a file, can stand before all flags. `first`
+    are fields whose values can stand there, in this order and without their names.
     """
     with edge():
         from lerobot_constructskill.parsing import parse
 
-        flags, epilog = sys.argv[1:], EPILOG
+        flags, epilog = _put_names(sys.argv[1:], first), EPILOG
         if presets:
             flags, epilog = _put_file(flags, presets), f"{_tell_names(presets)} {EPILOG}"
         print(action(parse(config_class, flags, epilog=epilog)))
+
+
+def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
+    """Put the names of fields before values that come before all flags."""
+    values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
+    if len(values) > len(first):
+        raise InputError(
+            f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
+            "marks, so that the shell leaves it alone."
+        )
+    return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *flags[len(values) :]]
 
 
 def _put_file(flags: list[str], kind: str) -> list[str]:

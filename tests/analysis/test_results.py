@@ -4,9 +4,8 @@ import shutil
 from pathlib import Path, PurePosixPath
 
 import pytest
-import yaml
 
-import lerobot_constructskill.plugin  # noqa: F401  reads `!policy`
+from lerobot_constructskill import tags
 from lerobot_constructskill.analysis.report import ink
 from lerobot_constructskill.scripts.report import ReportConfig, report
 
@@ -19,7 +18,7 @@ LARGEST = 5_000_000
 
 
 def load(path: Path) -> dict:
-    return yaml.safe_load(path.read_text())
+    return tags.read(path)
 
 
 def last(data: str | None) -> str | None:

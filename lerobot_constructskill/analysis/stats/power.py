@@ -6,7 +6,7 @@ from math import ceil, inf, sqrt
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import binom, hypergeom
-from statsmodels.stats.power import normal_sample_size_one_tail
+from statsmodels.stats.power import TTestIndPower, normal_sample_size_one_tail
 from statsmodels.stats.proportion import proportion_effectsize
 
 TARGET = 0.8
@@ -54,6 +54,30 @@ def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> float | N
     while seeds <= MOST and power(rate_a, rate_b, seeds, alpha) < TARGET:
         seeds += 1
     return seeds if seeds <= MOST else inf
+
+
+def detectable_mean_difference(deviation: float, seeds_a: int, seeds_b: int, alpha: float = 0.05) -> float:
+    """The smallest difference of two means over seeds that is found with 80 % power, by the t-test's power.
+
+    The permutation test of means has about the same. Above 1 no difference of two shares is found.
+
+    Args:
+        deviation: standard deviation of the seeds of a side, above 0.
+        seeds_a, seeds_b: two or more each.
+    """
+    effect = TTestIndPower().solve_power(nobs1=seeds_a, ratio=seeds_b / seeds_a, alpha=alpha, power=TARGET)
+    return float(np.squeeze(effect)) * deviation
+
+
+def seeds_needed_for_mean(difference: float, deviation: float, alpha: float = 0.05) -> float | None:
+    """Seeds a side with which this difference of means is found with 80 % power; None for no difference.
+
+    Infinite above `MOST`. Arguments as of `detectable_mean_difference`.
+    """
+    if round(difference, 12) == 0:
+        return None
+    enough = (n for n in range(2, MOST + 1) if detectable_mean_difference(deviation, n, n, alpha) <= difference)
+    return next(enough, inf)
 
 
 def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:

@@ -1,0 +1,76 @@
+"""How LeRobot is told which demonstrations to hold out: by their order, and a share that it takes from the end."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lerobot_constructskill.contract import held_out, held_out_last
+from lerobot_constructskill.dataset.dataset import check_is_there
+from lerobot_constructskill.errors import InputError
+
+
+@dataclass(frozen=True)
+class Split:
+    """The `dataset.episodes` and `dataset.eval_split` by which LeRobot holds out what the contract does.
+
+    Args:
+        episodes: every episode of the set, the held-out ones last.
+        n_held_out: how many are held out.
+        eval_split: share of each task's episodes that LeRobot takes from their end, rounded up; 0 holds out none.
+        frames: frames of the episodes that are trained on.
+    """
+
+    episodes: list[int]
+    n_held_out: int
+    eval_split: float
+    frames: int
+
+
+def split_of(root: Path) -> Split:
+    """The split of the data set in a folder.
+
+    Raises:
+        MissingError: there is no data set.
+        InputError: its episodes cannot be read, or LeRobot cannot split them as the contract does.
+    """
+    check_is_there(root)
+    files = sorted(root.glob("meta/episodes/*/*.parquet"))
+    try:
+        tables = [pq.read_table(file, columns=["episode_index", "length", "tasks"]) for file in files]
+        rows = pa.concat_tables(tables).sort_by("episode_index").to_pylist()
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"The episodes of {root}, meta/episodes/, cannot be read ({error}).") from None
+    if not rows:
+        raise InputError(f"The data set in {root} has no episodes.")
+    return split([row["length"] for row in rows], [next(iter(row["tasks"]), "") for row in rows])
+
+
+def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
+    """The split of episodes with these lengths, in frames, and these tasks.
+
+    LeRobot takes ceil(n * eval_split) of the n episodes of each task. That is k, as many as the contract holds out,
+    where eval_split is above (k - 1) / n and at most k / n; the middle of what is right for all tasks is taken.
+
+    Raises:
+        InputError: there is nothing that is right for all tasks.
+    """
+    out = set(held_out(len(lengths)))
+    frames = sum(length for episode, length in enumerate(lengths) if episode not in out)
+    counts = [_counts(task, tasks, out) for task in dict.fromkeys(tasks)]
+    low, high = max((k - 1) / n for k, n in counts), min(k / n for k, n in counts)
+    if out and low >= high:
+        told = ", ".join(f"{k} of {n}" for k, n in counts)
+        raise InputError(
+            f"Of the tasks of this set every eighth demonstration is {told}, and LeRobot holds out one share of all: "
+            "train on a set of each task, or on one with equally many demonstrations of each."
+        )
+    return Split(held_out_last(len(lengths)), len(out), (low + high) / 2 if out else 0.0, frames)
+
+
+def _counts(task: str, tasks: Sequence[str], out: set[int]) -> tuple[int, int]:
+    """How many episodes of a task are held out, and how many it has."""
+    own = [episode for episode, one in enumerate(tasks) if one == task]
+    return len(out.intersection(own)), len(own)

@@ -1,0 +1,125 @@
+"""`constructskill-compare`: is policy A better than policy B? Over training seeds, evaluated on the same starts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from lerobot_constructskill.analysis.section import Level
+from lerobot_constructskill.bounds import Among, Count, Device, Seed, Steps, Text, check
+from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.errors import TakenError
+from lerobot_constructskill.scripts.console import run
+
+if TYPE_CHECKING:
+    from lerobot_constructskill.comparison.find import Found
+    from lerobot_constructskill.comparison.sides import Side
+
+WORSE = "worse"
+FAILED = 3
+"""Exit status where A is worse and `--fail_if=worse` is given."""
+
+
+@dataclass
+class CompareConfig:
+    """Compare two policies by their training seeds: constructskill-compare A B [flags].
+
+    A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
+    seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
+    output folders of lerobot-train, which are evaluated where the other side was; output folders of lerobot-eval; or
+    recordings of $CONSTRUCTSKILL_RECORD.
+
+    Args:
+        a: the first side, the candidate.
+        b: the second side, what it is compared with.
+        task: where neither side says it.
+        obs_type: as of lerobot-eval's --env, where neither side says it; pixels by default.
+        episode_length: the same; the task's own by default.
+        perturb: the same; none by default.
+        perturb_seed: the same; 0 by default.
+        seed: what lerobot-eval was given; for two sides of checkpoints the first start, 1000 by default.
+        episodes: at most so many starts; for two sides of checkpoints 50 by default.
+        fail_if: "worse" ends with status 3 where A is worse than B; else the status is 0 whatever the verdict.
+        alpha: level of the tests.
+        out: folder for comparison.json, and recordings of what was evaluated, a side of later comparisons: OUT/a/*.
+        together: checkpoints that are in memory, and evaluated, at a time.
+        device: for checkpoints; that in the checkpoint by default.
+    """
+
+    a: Text
+    b: Text
+    task: Text | None = None
+    obs_type: Annotated[str, Among(tuple(OBS_TYPES))] | None = None
+    episode_length: Steps | None = None
+    perturb: str | None = None
+    perturb_seed: Seed | None = None
+    seed: Seed | None = None
+    episodes: Count | None = None
+    fail_if: Annotated[str, Among((WORSE,))] | None = None
+    alpha: Level = 0.05
+    out: Path | None = None
+    together: Count = 10
+    device: Device | None = None
+
+    def __post_init__(self):
+        check(self)
+
+    @property
+    def env(self) -> dict[str, Any]:
+        """Keyword arguments of `ConstructSkillEnv` that were given."""
+        names = ("task", "obs_type", "episode_length", "perturb", "perturb_seed")
+        return {name: value for name, value in asdict(self).items() if name in names and value is not None}
+
+
+def compare(config: CompareConfig) -> str:
+    """Compare the sides and return what is printed.
+
+    Raises:
+        MissingError: there is no such side.
+        InputError: a side cannot be read or evaluated, or has nothing in common with the other.
+        TakenError: the output folder exists.
+        SystemExit: A is worse, and `fail_if` says that this fails.
+    """
+    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.comparison import match
+    from lerobot_constructskill.comparison.find import find
+    from lerobot_constructskill.comparison.tell import as_json, tell
+
+    if config.out is not None and config.out.exists():
+        raise TakenError(f"The output folder {config.out} exists already; remove it or name another.")
+    a, b = find(config.a), find(config.b)
+
+    def evaluated(found: "Found", env: Mapping[str, Any], starts: Sequence[int]) -> "Side":
+        return _evaluate(config, found, env, starts, "a" if found is a else "b")
+
+    asked = match.Asked(config.env, config.seed, config.episodes)
+    comparison = match.compare(a, b, asked, evaluated, config.alpha)
+    told = tell(comparison, config.alpha)
+    if config.out is not None:
+        with replaced(config.out / "comparison.json") as partial:
+            partial.write_text(as_json(comparison))
+    if config.fail_if == comparison.judgement.verdict:
+        print(told)
+        raise SystemExit(FAILED)
+    return told
+
+
+def _evaluate(
+    config: CompareConfig, found: "Found", env: Mapping[str, Any], starts: Sequence[int], side: str
+) -> "Side":
+    import lerobot_constructskill.plugin  # noqa: F401
+    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
+
+    register_third_party_plugins()
+    from lerobot_constructskill.comparison.evaluate import evaluate
+
+    kept_in = config.out and config.out / side
+    return evaluate(found.name, found.folders, env, starts, config.together, config.device, kept_in)
+
+
+def main() -> None:
+    run(CompareConfig, compare, first=("a", "b"))
+
+
+if __name__ == "__main__":
+    main()

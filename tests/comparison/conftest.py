@@ -1,0 +1,93 @@
+"""Sides of comparisons on disk: a study's folder, results of lerobot-eval, recordings and checkpoints."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from random_features import config, tiny_weights  # noqa: F401
+
+from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
+from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Row, write_rows
+
+ENV = {"task": "block_to_bin", "episode_length": 5, "obs_type": "pixels_agent_pos"}
+STARTS = range(1000, 1010)
+
+
+@pytest.fixture
+def study(tmp_path):
+    """Write a study's folder; return what names its variant.
+
+    Each training seed placed from so many starts, the first ones; it failed where that is None, was not run where -1.
+    """
+
+    def write(placed: Sequence[int | None], name: str = "study", env: dict = ENV, starts: Sequence = STARTS) -> str:
+        common = {"run": None, "setting": "block", "variant": "ours", "role": VARIANT, "episodes": len(starts)}
+        common["versions"] = json.dumps({"lerobot": "0.6.1", "torch": name, "processor": "a CPU"})
+        rows = []
+        for seed, count in enumerate(placed):
+            if count is None or count < 0:
+                fault = {"error_kind": "fault" if count is None else NOT_RUN, "error": "it fell"}
+                rows.append(Row(training_seed=seed, evaluation_seed=starts[0], episode=0, **fault, **common))
+                continue
+            for i, start in enumerate(starts):
+                rows.append(Row(training_seed=seed, evaluation_seed=start, episode=i, placed=i < count, **common))
+        folder = tmp_path / name
+        folder.mkdir()
+        write_rows(rows, folder / "rows.parquet")
+        (folder / "study.yaml").write_text(yaml.safe_dump({"settings": {"block": {"env": env}}}))
+        return f"{folder}:block/ours"
+
+    return write
+
+
+@pytest.fixture
+def evaluated(tmp_path):
+    """Write folders as `lerobot-eval` leaves them; return a pattern of them."""
+
+    def write(placed: Sequence[int], name: str = "eval", group: str = "constructskill", number: int = 0) -> str:
+        for seed, count in enumerate(placed):
+            metrics = {"successes": [i < count for i in range(len(STARTS))], "max_rewards": [0.0] * len(STARTS)}
+            folder = tmp_path / name / f"seed_{seed}"
+            folder.mkdir(parents=True)
+            told = {"per_task": [{"task_group": group, "task_id": number, "metrics": metrics}]}
+            (folder / "eval_info.json").write_text(json.dumps(told))
+        return str(tmp_path / name / "seed_*")
+
+    return write
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """Write recordings as $CONSTRUCTSKILL_RECORD does, or in one file; return a pattern of the folders."""
+
+    def write(placed: Sequence[int], name: str = "recorded", whole: bool = False, **facts) -> str:
+        for seed, count in enumerate(placed):
+            folder = tmp_path / name / f"seed_{seed}"
+            episodes = [
+                Recording(start, placed=i < count, actions=[np.full(4, seed + i, np.float32)], **(ENV | facts))
+                for i, start in enumerate(STARTS)
+            ]
+            if whole:
+                write_recordings(episodes, folder / RECORDINGS)
+            else:
+                [one.write(folder) for one in episodes]
+        return str(tmp_path / name / "seed_*")
+
+    return write
+
+
+@pytest.fixture
+def checkpoints(tmp_path):
+    """Folders that look like checkpoints; return a pattern of them."""
+
+    def write(n: int, name: str = "train", inner: str = "checkpoints/last/pretrained_model") -> str:
+        for seed in range(n):
+            folder: Path = tmp_path / name / f"seed_{seed}" / inner
+            folder.mkdir(parents=True)
+            (folder / "config.json").write_text("{}")
+        return str(tmp_path / name / "seed_*")
+
+    return write

@@ -1,0 +1,202 @@
+"""Two sides are brought together by where and from which starts they were evaluated, and judged over seeds."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from lerobot_constructskill.analysis.stats.comparisons import Verdict
+from lerobot_constructskill.comparison import match
+from lerobot_constructskill.comparison.find import find
+from lerobot_constructskill.comparison.read import read_study
+from lerobot_constructskill.comparison.sides import Side
+from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.envs.recording import Recording
+from lerobot_constructskill.errors import InputError, MissingError, TakenError
+from lerobot_constructskill.scripts import compare as script
+from lerobot_constructskill.scripts.compare import FAILED, CompareConfig, compare
+from lerobot_constructskill.study.rows import read_rows
+
+ENV = {"task": "block_to_bin", "episode_length": 5, "obs_type": "pixels_agent_pos"}
+RESULTS = Path(__file__).parents[2] / "results"
+GOOD, BAD = [10, 10, 9, 10, 10], [1, 0, 2, 0, 1]
+
+
+def no_evaluation(*_):
+    raise AssertionError("nothing is to be evaluated")
+
+
+def compared(a: str, b: str, evaluate=no_evaluation, **asked) -> match.Comparison:
+    return match.compare(find(a), find(b), match.Asked(**asked), evaluate, 0.05)
+
+
+def test_a_study_is_compared_with_recordings_and_results_of_lerobot_eval(study, recorded, evaluated):
+    published = study(BAD)
+    many, one = recorded(GOOD), recorded(GOOD, "one", whole=True)
+    for other, asked in ((many, {}), (one, {}), (evaluated(GOOD), {"seed": 1000})):
+        comparison = compared(other, published, **asked)
+        assert comparison.judgement.verdict is Verdict.BETTER and comparison.starts == list(range(1000, 1010))
+        assert comparison.rates_a == [count / 10 for count in GOOD]
+        assert comparison.rates_b == [count / 10 for count in BAD]
+        assert compared(published, other, **asked).judgement.verdict is Verdict.WORSE
+
+
+def test_every_published_study_has_a_variant_that_can_be_compared_with():
+    for folder in RESULTS.glob("*/"):
+        arms = read_rows(folder / "rows.parquet").query("role == 'variant' and placed.notna()")
+        side = read_study(folder, f"{arms['setting'].iloc[0]}/{arms['variant'].iloc[0]}")
+        assert side.conditions.task in TASKS and side.starts and "lerobot" in side.versions, folder
+
+
+def test_a_failed_training_seed_counts_as_one_that_did_not_place_and_a_missing_one_not_at_all(study):
+    comparison = compared(study([10, None, 10, -1, 10]), study(GOOD, "other"))
+    assert comparison.rates_a == [1.0, 0.0, 1.0, 1.0] and comparison.judgement.counts_a == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("task", "brick_on_brick", r"task \(block_to_bin, brick_on_brick\)"),
+        ("episode_length", 6, r"episode_length \(5, 6\)"),
+        ("obs_type", "pixels", r"obs_type \(pixels_agent_pos, pixels\)"),
+        ("perturb", "camera=2", r"perturbation \(none, \+camera=2\+seed=0\)"),
+    ],
+)
+def test_sides_of_other_conditions_are_refused_and_what_differs_is_named(name, value, said, study, recorded):
+    published = study(GOOD)
+    with pytest.raises(InputError, match=f"cannot be compared: they differ in {said}"):
+        compared(published, recorded(GOOD, **{name: value}))
+    with pytest.raises(InputError, match=f"and what was asked for cannot be compared: they differ in {said}"):
+        compared(published, recorded(GOOD, "same"), env={name: value})
+
+
+def test_two_spellings_of_a_perturbation_are_one(study, recorded):
+    published = study(GOOD, env=ENV | {"perturb": "camera=1, light=2"})
+    assert compared(published, recorded(GOOD, perturb="light=2,camera=1")).judgement.verdict is Verdict.INCONCLUSIVE
+
+
+def test_starts_are_those_in_common(study):
+    whole, later = study(GOOD), study(GOOD, "later", starts=range(1008, 1018))
+    comparison = compared(whole, later)
+    assert (comparison.starts, comparison.n_starts) == ([1008, 1009], 18)
+    assert comparison.rates_a == [1.0, 1.0, 0.5, 1.0, 1.0]
+    with pytest.raises(InputError, match="no start in common: .* starts 1000 to 1009 and .* starts 2000 to 2004"):
+        compared(whole, study(GOOD, "elsewhere", starts=range(2000, 2005)))
+    assert compared(whole, study(BAD, "bad"), episodes=3).starts == [1000, 1001, 1002]
+
+
+def test_checkpoints_are_evaluated_where_the_other_side_was(study, checkpoints):
+    seen = []
+
+    def evaluate(found, env, starts):
+        seen.append((len(found.folders), env, list(starts)))
+        return Side(found.name, "checkpoints", env, [dict.fromkeys(starts, True)] * len(found.folders))
+
+    env = {"task": "block_to_bin", "episode_length": 7, "light_robot": False}
+    assert compared(checkpoints(2), study(BAD, env=env), evaluate, episodes=4).judgement.mean_a.value == 1
+    assert seen == [(2, env, [1000, 1001, 1002, 1003])]
+    with pytest.raises(InputError, match="add --task"):
+        compared(checkpoints(2, "one"), checkpoints(3, "two"), evaluate)
+    seen.clear()
+    compared(str(checkpoints(2, "a")), checkpoints(3, "b", ""), evaluate, env={"task": "block_to_bin"}, seed=7)
+    assert seen == [(n, {"task": "block_to_bin"}, list(range(7, 57))) for n in (2, 3)]
+
+
+def test_of_lerobot_eval_the_start_has_to_be_said_and_the_rest_is_the_other_sides(study, evaluated):
+    published = study(GOOD)
+    with pytest.raises(InputError, match="does not write from which starts it evaluated: add --seed"):
+        compared(evaluated(GOOD), published)
+    assert compared(evaluated(GOOD, "bins", "bins", 2), published, seed=1000).starts
+    for group, number in (("bins", 1), ("constructskill+camera=1+seed=0", 0), ("pusht", 0)):
+        with pytest.raises(InputError, match=re.escape(f"of block_to_bin for certain; it has: {group} {number}")):
+            compared(evaluated(GOOD, f"of_{group}", group, number), published, seed=1000)
+    with pytest.raises(InputError, match="leave out --seed"):
+        compared(published, study(GOOD, "two"), seed=1000)
+
+
+def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
+    published, train = study(GOOD), checkpoints(2)
+    refusals = {
+        "nowhere/seed_*": "There is no folder 'nowhere/seed_",
+        str(tmp_path): "is no checkpoint .config.json., no output of lerobot-train",
+        f"{tmp_path}/study:block/theirs": "has no variant 'block/theirs'; name one as in .*; it has: block/ours",
+        f"{tmp_path}/study": "name one as in .*:setting/variant; it has: block/ours",
+        f"{train},{recorded(GOOD)}": "of several kinds .checkpoint, recordings.",
+        f"{train},{tmp_path}/train/seed_1": "names a folder twice",
+    }
+    for text, said in refusals.items():
+        with pytest.raises((InputError, MissingError), match=said):
+            compared(text, published)
+    with pytest.raises(InputError, match="is both sides"):
+        compared(published, published)
+    with pytest.raises(InputError, match="Every training seed of '.*' failed, so there is nothing"):
+        compared(published, study([None, None], "failed"))
+    with pytest.raises(InputError, match="No run of 'block/ours' in '.*' has been made"):
+        compared(published, study([-1], "missing"))
+    with pytest.raises(TakenError, match="exists already"):
+        compare(CompareConfig(published, study(BAD, "b"), out=tmp_path))
+
+
+def test_damaged_files_are_one_sentence(study, evaluated, recorded, tmp_path):
+    published = study(GOOD)
+    for damaged in ("{}", "[", '{"per_task": [{"task_group": "constructskill", "task_id": 0, "metrics": {}}]}'):
+        pattern = evaluated(GOOD[:1], f"eval_{len(damaged)}")
+        next(tmp_path.glob(f"eval_{len(damaged)}/*/*.json")).write_text(damaged)
+        with pytest.raises(InputError, match="is not what lerobot-eval writes"):
+            compared(pattern, published, seed=1000)
+    pattern = recorded(GOOD[:1])
+    Recording(1000, **ENV).write(next(tmp_path.glob("recorded/*")))
+    with pytest.raises(InputError, match="has two recordings of start 1000"):
+        compared(pattern, published)
+    next(tmp_path.glob("recorded/*/*.parquet")).write_bytes(b"no")
+    with pytest.raises(InputError, match="cannot be read"):
+        compared(pattern, published)
+    (tmp_path / "study" / "study.yaml").write_text("settings: {}")
+    with pytest.raises(InputError, match="does not say how 'block' is evaluated"):
+        compared(published, study(BAD, "b"))
+
+
+def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, recorded, evaluated):
+    told = compare(CompareConfig(study(GOOD, "torch_1"), study(BAD, "torch_2")))
+    assert "A is better than B." in told and "5 of 5" in told
+    assert "They differ in torch (torch_1 and torch_2)." in told
+    assert "Both were made with lerobot 0.6.1; processor a CPU." in told
+    one = compare(CompareConfig(recorded(GOOD[:1]), study(BAD[:1])))
+    assert "One training seed a side tells how these two checkpoints do, and nothing of their policies" in one
+    assert "So many seeds do not show which of them is better." in one
+    assert "They differ in torch (" in one and "B alone tells lerobot 0.6.1; processor a CPU." in one
+    few = compare(CompareConfig(evaluated(GOOD[:3]), study(BAD[:3], "few"), seed=1000))
+    assert "3 and 3 seeds can show no difference, however large: their p-value is at least 0.10." in few
+    assert "does not write where it evaluated: of A that is assumed" in few and "B alone tells lerobot 0.6.1" in few
+
+
+def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys, monkeypatch, tmp_path):
+    good, bad = study(GOOD), study(BAD, "bad")
+    for a, b, flags, status in (
+        (bad, good, [], 0),
+        (bad, good, ["--fail_if=worse"], FAILED),
+        (good, bad, ["--fail_if=worse"], 0),
+        (good, study(GOOD, "same"), ["--fail_if=worse"], 0),
+        (good, "nowhere", ["--fail_if=worse"], 1),
+        (good, bad, ["--fail_if=better"], 1),
+        (good, bad, ["third"], 1),
+    ):
+        monkeypatch.setattr("sys.argv", ["constructskill-compare", a, b, *flags])
+        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+        try:
+            script.main()
+            found = 0
+        except SystemExit as ended:
+            found = ended.code
+        out, said = capsys.readouterr()
+        assert ("put a pattern in quotation marks" in said) == ("third" in flags)
+        assert found == status and ("than B." in out or "do not show which" in out) == (status != 1), (flags, out)
+
+
+def test_every_number_is_in_a_file(study, tmp_path):
+    compare(CompareConfig(study(GOOD), study([10, 10, None], "b"), out=tmp_path / "out"))
+    told = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert told["rates_b"] == [1.0, 1.0, 0.0] and told["b"]["seeds"][2] is None
+    assert told["judgement"]["verdict"] == "inconclusive at this number of seeds"
+    assert len(told["judgement"]["difference"]) == 3 and told["conditions"]["task"] == "block_to_bin"
