@@ -31,6 +31,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.autocast import outside_autocast
 from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
@@ -95,7 +96,7 @@ class PickPlaceEnv(BaseEnv):
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
-        OSError: there is no Vulkan device to render with, or no GPU for several environments in one simulator.
+        OSError: there is no Vulkan device to render with.
         ValueError: another brick size is asked of a task without a brick.
 
     Non-obvious behaviours: the rotation channels are part of the action as in any `pd_ee_delta_pose`
@@ -147,13 +148,13 @@ class PickPlaceEnv(BaseEnv):
                 "render_backend must be auto or cpu on this machine, where no GPU can render, not 'gpu'; "
                 "`constructskill-doctor` says what is missing."
             )
-        if steps_on_gpu(kwargs.get("sim_backend", "auto"), num_envs := kwargs.get("num_envs", 1)):
-            enable_gpu_physics(num_envs, render_backend)
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot
         if robot_uids is None:
             robot_uids = LightPanda.uid if self.light_robot else QuickPanda.uid
+        if steps_on_gpu(kwargs.get("sim_backend", "auto"), kwargs.get("num_envs", 1)):
+            enable_gpu_physics(in_software)
         try:
             if in_software:
                 keep_software_renderer()
@@ -268,6 +269,16 @@ class PickPlaceEnv(BaseEnv):
         builder.initial_pose = sapien.Pose(p=self.bin_position)
         return builder.build_kinematic(name="bin")
 
+    # Gymnasium
+
+    @outside_autocast
+    def reset(self, *args, **kwargs):
+        return super().reset(*args, **kwargs)
+
+    @outside_autocast
+    def step(self, action):
+        return super().step(action)
+
     # Initial state
 
     def _set_episode_rng(self, seed, env_idx: torch.Tensor) -> None:
@@ -370,6 +381,7 @@ class PickPlaceEnv(BaseEnv):
         """In kilograms."""
         return float(self.object.mass[0])
 
+    @outside_autocast
     def agent_state(self) -> torch.Tensor:
         """Proprioception as `contract.STATE_NAMES` names it, (num_envs, 8), in the robot's base frame.
 
@@ -381,6 +393,7 @@ class PickPlaceEnv(BaseEnv):
         rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q).double()).float()
         return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
 
+    @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
         """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
         constants = {
