@@ -31,6 +31,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.autocast import outside_autocast
 from lerobot_constructskill.sim.clipping import Clipping
 from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
 from lerobot_constructskill.sim.hold import HOLDING, Hold
@@ -93,8 +94,7 @@ class PickPlaceEnv(BaseEnv):
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
-        OSError: there is no Vulkan device to render with, no window to show, or no GPU for several environments in one
-            simulator.
+        OSError: there is no Vulkan device to render with, no window to show, or no GPU for several environments.
         ValueError: another brick size is asked of a task without a brick, a dense reward, or an observation or control
             mode that there is not.
 
@@ -152,13 +152,13 @@ class PickPlaceEnv(BaseEnv):
                 "reward_mode must be sparse (the stage reached: 0, 0.5 once lifted, 1 once placed) or none, not "
                 f"'{kwargs['reward_mode']}': there is no dense reward."
             )
-        if steps_on_gpu(kwargs.get("sim_backend", "auto"), num_envs := kwargs.get("num_envs", 1)):
-            enable_gpu_physics(num_envs, render_backend)
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot
         if robot_uids is None:
             robot_uids = LightPanda.uid if self.light_robot else QuickPanda.uid
+        if steps_on_gpu(kwargs.get("sim_backend", "auto"), kwargs.get("num_envs", 1)):
+            enable_gpu_physics(in_software)
         try:
             if in_software:
                 keep_software_renderer()
@@ -274,6 +274,16 @@ class PickPlaceEnv(BaseEnv):
         builder.initial_pose = sapien.Pose(p=self.bin_position)
         return builder.build_kinematic(name="bin")
 
+    # Gymnasium
+
+    @outside_autocast
+    def reset(self, *args, **kwargs):
+        return super().reset(*args, **kwargs)
+
+    @outside_autocast
+    def step(self, action):
+        return super().step(action)
+
     # Initial state
 
     def _set_episode_rng(self, seed, env_idx: torch.Tensor) -> None:
@@ -380,6 +390,7 @@ class PickPlaceEnv(BaseEnv):
         """In kilograms."""
         return float(self.object.mass[0])
 
+    @outside_autocast
     def agent_state(self) -> torch.Tensor:
         """Proprioception as `contract.STATE_NAMES` names it, (num_envs, 8), in the robot's base frame.
 
@@ -391,6 +402,7 @@ class PickPlaceEnv(BaseEnv):
         rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q).double()).float()
         return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
 
+    @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
         """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
         constants = {

@@ -72,8 +72,8 @@ WITHOUT_A_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU can"
         ({"control_mode": "metres"}, "metres not in supported modes: .*pd_ee_delta_pose"),
         ({"robot_uids": "panda"}, None),
         ({"render_mode": "rgb_array"}, None),
-        pytest.param({"num_envs": 4}, "physics on a GPU, and there is none", marks=WITHOUT_A_GPU),
-        pytest.param({"sim_backend": "gpu"}, "physics on a GPU, and there is none", marks=WITHOUT_A_GPU),
+        pytest.param({"num_envs": 4}, "need a GPU, and there is none", marks=WITHOUT_A_GPU),
+        pytest.param({"sim_backend": "gpu"}, "need a GPU, and there is none", marks=WITHOUT_A_GPU),
         pytest.param({"render_mode": "human"}, "render_mode=human needs a display", marks=WITHOUT_A_GPU),
     ],
     ids=str,
@@ -133,6 +133,17 @@ def test_equal_seeds_and_actions_give_equal_trajectories(blind):
     assert torch.isfinite(first).all()
 
 
+def test_mixed_precision_around_a_simulator_changes_nothing():
+    """As in `lerobot-eval --policy.use_amp=true` with one environment, which is in the process of the policy."""
+    env = make("brick_to_bin_turned")
+    alone = trajectory(env, seed=5)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(trajectory(env, seed=5), alone)
+        agent = env.agent_state()
+    assert torch.equal(env.agent_state(), agent)
+    env.close()
+
+
 def test_initial_states_vary_exactly_where_the_task_says_so(blind):
     poses = []
     for seed in range(8):
@@ -171,7 +182,7 @@ def test_an_episode_starts_alike_alone_and_in_a_batch_on_the_gpu():
     if best_render_backend() != "gpu":
         pytest.skip("several environments in one simulator need a GPU")
     done = subprocess.run([sys.executable, "-c", BATCH], capture_output=True, text=True)
-    if "library cannot be loaded" in done.stderr:
+    if "library for it cannot be loaded" in done.stderr:
         pytest.skip("PhysX for the GPU cannot be had here")
     assert done.returncode == 0, done.stderr
     alone = make("block_to_bin")
@@ -182,11 +193,11 @@ def test_an_episode_starts_alike_alone_and_in_a_batch_on_the_gpu():
 @pytest.mark.parametrize(
     ("render_backend", "error", "said"),
     [
-        ("gpu", ConnectionError("no route"), r"library cannot be loaded \(no route\)"),
-        ("gpu", OSError("libcuda.so: cannot open"), r"library cannot be loaded \(libcuda.so"),
-        ("none", BadZipFile("File is not a zip file"), r"library cannot be loaded \(File is not"),
-        ("none", RuntimeError("GPU PhysX can only be enabled once"), "must be the first scene of a process"),
-        ("cpu", None, "where the CPU cannot render: use render_backend=gpu or none"),
+        ("gpu", ConnectionError("no route"), r"library for it cannot be loaded \(no route\)"),
+        ("gpu", OSError("libcuda.so: cannot open"), r"library for it cannot be loaded \(libcuda.so"),
+        ("none", BadZipFile("File is not a zip file"), r"library for it cannot be loaded \(File is not"),
+        ("none", RuntimeError("GPU PhysX can only be enabled once"), "must be the first simulator of a process"),
+        ("cpu", None, "that renders them too: use render_backend=gpu or none"),
     ],
 )
 def test_gpu_physics_that_cannot_be_had_is_refused_in_one_sentence(render_backend, error, said, monkeypatch):
@@ -196,7 +207,7 @@ def test_gpu_physics_that_cannot_be_had_is_refused_in_one_sentence(render_backen
     monkeypatch.setattr(gpu_physics.sapien, "Device", lambda name: name)
     monkeypatch.setattr(gpu_physics.physx, "enable_gpu", enable_gpu)
     monkeypatch.setattr(scene, "best_render_backend", lambda: "gpu")
-    with pytest.raises(UserError, match=f"^2 environments in one .* need physics on a GPU.* {said}") as told:
+    with pytest.raises(UserError, match=f"^Several environments in one simulator need a GPU.* {said}") as told:
         make("block_to_bin", num_envs=2, render_backend=render_backend)
     assert "\n" not in str(told.value)
 
