@@ -54,16 +54,24 @@ FINGER_TARGETS = (-0.01, 0.04)
 STATE_NAMES = ("ee_x", "ee_y", "ee_z", "ee_rx", "ee_ry", "ee_rz", "finger_left", "finger_right")
 """Proprioception: position in metres and axis-angle in radians in the robot's base frame, fingers in metres."""
 
+POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
+"""A position in metres and a unit quaternion, w first."""
+
+JOINTS = (*(f"panda_joint{number}" for number in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2")
+"""The Panda's seven arm joints, in rad and rad/s, and its two fingers, in m and m/s, as its URDF names them."""
+
 SIM_STATE = {
-    "tcp_pose": 7,
-    "fingers": 2,
-    "object_pose": 7,
-    "object_size": 3,
-    "object_mass": 1,
-    "bin_position": 3,
-    "bin_interior": 3,
+    "tcp_pose": POSE,
+    "fingers": ("finger_left", "finger_right"),
+    "object_pose": POSE,
+    "object_size": ("x", "y", "z"),
+    "object_mass": ("mass",),
+    "bin_position": ("x", "y", "z"),
+    "bin_interior": ("x", "y", "z"),
+    "joint_positions": JOINTS,
+    "joint_velocities": JOINTS,
 }
-"""Privileged state, name to length: SI units, world frame, poses as position and (w, x, y, z) quaternion."""
+"""Privileged state, name to the names of its numbers: SI units, world frame."""
 
 DEMO_SEED_START = 1_000_000
 """First seed of a data set. LeRobot's evaluations start at the training seed or at 1000."""

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, bind_patches, describe
 from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 
@@ -75,6 +75,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
     dataset.finalize()
     patches = rng.normal(size=(EPISODES * LENGTH, spec.n_patches, dim)).astype(np.float16)
     np.save(root / PATCHES_FILE, patches)
+    bind_patches(root)
     return LeRobotDataset("local/random", root=root)
 
 

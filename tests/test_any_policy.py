@@ -46,9 +46,9 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def demonstrations(folder):
-    """Two demonstrations with both cameras and the state, the second held out."""
+    """Two lossless demonstrations with both cameras and the state, the second held out."""
     root = folder / "demonstrations"
-    record(GenerateConfig("local/demos", str(root), episodes=2, obs_type="pixels_agent_pos"))
+    record(GenerateConfig("local/demos", str(root), episodes=2, obs_type="pixels_agent_pos", video="lossless"))
     return [f"--dataset.root={root}", "--dataset.episodes=[0,1]", "--dataset.eval_split=0.4"]
 
 

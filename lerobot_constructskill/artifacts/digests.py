@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import os
+from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from pathlib import Path
@@ -18,10 +20,24 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def files_below(root: Path, *folders: str) -> Iterator[Path]:
+    """Yield the files below some folders of a data set, in the order of their paths.
+
+    A folder may be a link, to a larger disk for instance: `Path.rglob` would leave out what lies there.
+    """
+    for folder in folders:
+        yield from sorted(
+            path
+            for parent, _, names in os.walk(root / folder, followlinks=True)
+            for path in (Path(parent, name) for name in names)
+            if path.is_file()
+        )
+
+
 def data_sha256(root: Path) -> str:
     """Hash the frames and videos of a data set: relative paths and bytes, in the order of the paths."""
     total = hashlib.sha256()
-    for path in sorted(p for folder in ("data", "videos") for p in (root / folder).rglob("*") if p.is_file()):
+    for path in files_below(root, "data", "videos"):
         total.update(path.relative_to(root).as_posix().encode())
         total.update(bytes.fromhex(file_sha256(path)))
     return total.hexdigest()

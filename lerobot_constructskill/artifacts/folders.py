@@ -44,11 +44,23 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
                 raise TakenError(exists)
             _clear(partial, keep)
             yield folder
+            _open_up(folder)
             folder.rename(root)
         finally:
             _clear(partial, None if root.exists() else keep)
             if not any(path.name != MARK for path in partial.iterdir()):
                 shutil.rmtree(partial, ignore_errors=True)
+
+
+def _open_up(folder: Path) -> None:
+    """Give all that lies in a folder the access that it has itself by the umask.
+
+    `tempfile`, by which LeRobot joins videos, lets nobody but their owner read files.
+    """
+    access = folder.stat().st_mode & 0o777
+    for path in folder.rglob("*"):
+        if not path.is_symlink():
+            path.chmod(path.stat().st_mode | (access if path.is_dir() else access & 0o666))
 
 
 def sweep(root: Path) -> None:

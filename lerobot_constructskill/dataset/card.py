@@ -8,7 +8,7 @@ from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_valu
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
 from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
-from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.interface import describe
@@ -28,6 +28,8 @@ MEANINGS = {
     "sim.object_mass": "privileged: object's mass, kg",
     "sim.bin_position": "privileged: centre of the bin's interior, m, world frame",
     "sim.bin_interior": "privileged: the bin's inner edges, m",
+    "sim.joint_positions": "privileged: the arm's seven joints (rad) and the two fingers (m)",
+    "sim.joint_velocities": "privileged: the same in a second (rad/s, m/s)",
     "sim.seed": "seed of the episode's initial state and noise",
     "dagger.round": "the round in which the frame came about, 0 for demonstrations",
     "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",
@@ -80,6 +82,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
         "discarded_seeds": data.facts["discarded_seeds"],
         "episodes": len(lengths),
         "frames": len(data.rows),
+        "joints": data.has_joints,
         "shortest": min(lengths),
         "longest": max(lengths),
         "held_out": held_out(len(lengths)),
@@ -111,6 +114,8 @@ def render(facts: dict[str, Any]) -> str:
     task = get_task(facts["generator"]["task"])
     columns = dagger_features if "dagger" in facts else demonstration_features
     features = columns(task, facts["generator"]["obs_type"])
+    if not facts.get("joints"):
+        features = as_before_joints(features)
     cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return markdown.render(

@@ -22,6 +22,7 @@ from lerobot_constructskill.contract import (
 from lerobot_constructskill.dataset.card import Provenance
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
+from lerobot_constructskill.dataset.reading import check_reading
 from lerobot_constructskill.dataset.rounds import check_rounds
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
@@ -150,7 +151,7 @@ def check_noise(data: DataSet) -> Iterator[str]:
 def _advice(data: DataSet, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
     """What the expert advises in some frames."""
     expert = make_expert(get_task(data.config.task), data.config.expert)
-    known = {name: data.column(f"sim.{name}") for name in SIM_STATE}
+    known = {name: data.column(f"sim.{name}") for name in SIM_STATE if f"sim.{name}" in data.columns}
     for row in rows:
         state = PrivilegedState(**{name: np.atleast_1d(values[row]) for name, values in known.items()})
         yield row, expert.advise(state).action
@@ -292,6 +293,7 @@ CHECKS: dict[str, Check] = {
     "Episodes": check_episodes,
     "Time stamps": check_timestamps,
     **FRAME_CHECKS,
+    "Reading": check_reading,
     "Duplicates": check_duplicates,
     "Hold-out": check_hold_out,
     "Statistics": check_statistics,

@@ -10,7 +10,13 @@ import numpy as np
 import pandas as pd
 
 from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import (
+    JOINT_COLUMNS,
+    SIDECAR,
+    as_before_joints,
+    dagger_features,
+    demonstration_features,
+)
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.parsing import decode
@@ -79,9 +85,17 @@ class DataSet:
 
     @cached_property
     def columns(self) -> dict[str, dict[str, Any]]:
-        """The columns that it should have, those of DAgger among them where it says that a learner drove."""
-        features = dagger_features if "dagger" in self.facts else demonstration_features
-        return features(get_task(self.config.task), self.config.obs_type)
+        """The columns that it should have, those of DAgger among them where it says that a learner drove.
+
+        A set that has no joints at all is of before they were recorded.
+        """
+        made = dagger_features if "dagger" in self.facts else demonstration_features
+        features = made(get_task(self.config.task), self.config.obs_type)
+        return features if self.has_joints else as_before_joints(features)
+
+    @property
+    def has_joints(self) -> bool:
+        return any(name in self.info["features"] or name in self.rows for name in JOINT_COLUMNS)
 
     @cached_property
     def rounds(self) -> np.ndarray:

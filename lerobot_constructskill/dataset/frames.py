@@ -37,11 +37,12 @@ def check_videos(data: DataSet) -> Iterator[str]:
             yield from _check_packets(path, expected, path.relative_to(data.root))
 
 
-def packet_times(path: Path, name: Path) -> list[float]:
+def packet_times(path: Path, name: Path, of_keys: bool = False) -> list[float]:
     """Time stamps of a video's frames in seconds, without decoding.
 
     Args:
         name: what to call it.
+        of_keys: whether to return those of key frames alone.
 
     Raises:
         InputError: it is missing or cannot be read.
@@ -54,7 +55,9 @@ def packet_times(path: Path, name: Path) -> list[float]:
         with av.open(str(path)) as video:
             stream = video.streams.video[0]
             return sorted(
-                float(packet.pts * stream.time_base) for packet in video.demux(stream) if packet.pts is not None
+                float(packet.pts * stream.time_base)
+                for packet in video.demux(stream)
+                if packet.pts is not None and (packet.is_keyframe or not of_keys)
             )
     except (av.FFmpegError, IndexError) as error:
         raise InputError(f"{name} cannot be read ({error}).") from None

@@ -2,13 +2,14 @@
 
 import json
 import logging
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_constructskill.artifacts.digests import data_sha256
+from lerobot_constructskill.artifacts.digests import data_sha256, files_below
 from lerobot_constructskill.artifacts.store import SPEC
 from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
 from lerobot_constructskill.dataset.frames import packet_times
@@ -33,6 +34,9 @@ PUSHED = [
 
 INFO = "meta/info.json"
 """What makes a folder a data set of LeRobot's."""
+
+SAME_RATE = 0.01
+"""Share by which a video's rate may differ from the data set's."""
 
 UNTOUCHED = {".gitattributes"}
 """What the Hub itself puts into a new repository."""
@@ -79,8 +83,13 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
     return Path(folder)
 
 
-def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
+def open_lerobot(
+    repo_id: str, root: Path | None, revision: str | None = None, video_backend: str | None = None
+) -> "LeRobotDataset":
     """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
+
+    Args:
+        video_backend: LeRobot's decoder; its default is torchcodec where that is installed.
 
     Raises:
         FileNotFoundError: there is no data set in `root`.
@@ -95,7 +104,7 @@ def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -
         check_is_there(root)
     try:
         with one_sentence(repo_id, revision):
-            dataset = LeRobotDataset(repo_id, root=root, revision=revision)
+            dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
     except (UserError, OSError):
         raise
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
@@ -106,15 +115,22 @@ def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -
 
 
 def _check_videos(dataset: "LeRobotDataset") -> None:
-    """Refuse videos that are not whole now, before an hour of work has come to them."""
+    """Refuse videos that are not whole, or of another rate than the data set says, before an hour of work."""
     rows: dict[Path, int] = {}
     for episode in dataset.meta.episodes:
         for camera in dataset.meta.video_keys:
             path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], camera)
             rows[path] = rows.get(path, 0) + episode["length"]
     for path, wanted in rows.items():
-        if (found := len(packet_times(path, path.relative_to(dataset.root)))) < wanted:
-            raise InputError(f"{path.relative_to(dataset.root)} has {found} frames, but its episodes have {wanted}.")
+        name = path.relative_to(dataset.root)
+        times = packet_times(path, name)
+        if len(times) < wanted:
+            raise InputError(f"{name} has {len(times)} frames, but its episodes have {wanted}.")
+        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else dataset.fps
+        if abs(rate - dataset.fps) > SAME_RATE * rate:
+            raise InputError(
+                f"{INFO} says {dataset.fps} frames a second, but {name} has {rate:.4g}: put back the fps that it had."
+            )
 
 
 def choose_held_out(
@@ -256,6 +272,17 @@ def _is_cut(root: Path, **repo: str) -> bool:
     return Path(api.hf_hub_download(**repo, filename=INFO)).read_bytes() == (root / INFO).read_bytes()
 
 
+@contextmanager
+def _without_linked_folders(root: Path) -> Iterator[Path]:
+    """Yield a folder of links to all files of `root`: the Hub's client does not look into a folder that is a link."""
+    with tempfile.TemporaryDirectory() as folder:
+        for path in files_below(root, ""):
+            link = Path(folder) / path.relative_to(root)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(path.resolve())
+        yield Path(folder)
+
+
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
     """Put the folder of a data set on the Hub, in one commit, and tag it; return the commit's address.
 
@@ -283,7 +310,8 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         if not update and (CODEBASE_VERSION in tagged or not _is_cut(root, **repo)):
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
         stale = ["data/*", "videos/*", "meta/*"]
-        commit = api.upload_folder(**repo, folder_path=root, allow_patterns=PUSHED, delete_patterns=stale)
+        with _without_linked_folders(root) as folder:
+            commit = api.upload_folder(**repo, folder_path=folder, allow_patterns=PUSHED, delete_patterns=stale)
         for name in dict.fromkeys(filter(None, (tag, CODEBASE_VERSION))):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)

@@ -14,7 +14,8 @@ class ReplayResult:
 
     Args:
         same_outcome: reward and success are as recorded at every step.
-        deviation: largest difference of any number of `observation.state` from the recorded one, in m and rad.
+        deviation: largest difference of any number of `observation.state`, and of `sim.joint_positions` where they
+            were recorded, from the recorded one, in m and rad.
     """
 
     same_outcome: bool
@@ -24,16 +25,17 @@ class ReplayResult:
 def replay(data: DataSet, episode: int) -> ReplayResult:
     """Start from the episode's seed and execute what was executed."""
     span, config = data.spans()[episode], data.config
-    column = {name: data.column(name)[span] for name in ("dart.executed_action", "observation.state", "sim.seed")}
+    states = ["observation.state", *(["sim.joint_positions"] if data.has_joints else [])]
+    recorded = np.concatenate([data.column(name)[span] for name in states], axis=1)
     outcomes = np.stack([data.column("next.reward")[span], data.column("next.success")[span]], axis=1)
     env = ConstructSkillEnv(config.task, config.obs_type, len(outcomes) + 1, config.light_robot, render_backend="none")
     try:
-        env.reset(seed=int(column["sim.seed"][0]))
-        states, reached = [], []
-        for action in column["dart.executed_action"]:
-            states.append(env.agent_state())
+        env.reset(seed=int(data.column("sim.seed")[span.start]))
+        found, reached = [], []
+        for action in data.column("dart.executed_action")[span]:
+            found.append(np.concatenate([env.agent_state(), env.privileged_state()["joint_positions"]]))
             reached.append(env.step(action)[1:3])
     finally:
         env.close()
-    deviation = np.abs(np.array(states) - column["observation.state"]).max()
+    deviation = np.abs(np.array(found)[:, : recorded.shape[1]] - recorded).max()
     return ReplayResult(bool((np.array(reached, dtype=float) == outcomes).all()), float(deviation))

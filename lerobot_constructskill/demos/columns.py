@@ -14,31 +14,43 @@ ACTORS = EXPERT, LEARNER = "expert", "learner"
 SIDECAR = "meta/constructskill.json"
 """Where a data set keeps how it was made, relative to its root."""
 
+JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
+"""What data sets of before have not: none of these columns, and no names of the numbers of `sim.*` and `next.*`."""
+
 
 def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
     """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen as `obs_type`."""
-    action = list(task.action_names)
     return {
         **{CAMERAS[name].key: _video() for name in OBS_TYPES[obs_type]},
-        "observation.state": _floats(len(STATE_NAMES), list(STATE_NAMES)),
-        "action": _floats(len(action), action),
-        "dart.executed_action": _floats(len(action), action),
-        "dart.noise": _floats(3, action[:3]),
-        "phase": {"dtype": "string", "shape": (1,), "names": None},
-        **{f"sim.{name}": _floats(length) for name, length in SIM_STATE.items()},
-        "sim.seed": {"dtype": "int64", "shape": (1,), "names": None},
-        "next.reward": _floats(1),
-        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
-        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+        "observation.state": _column("float32", *STATE_NAMES),
+        "action": _column("float32", *task.action_names),
+        "dart.executed_action": _column("float32", *task.action_names),
+        "dart.noise": _column("float32", *task.action_names[:3]),
+        "phase": _column("string", "phase"),
+        **{f"sim.{name}": _column("float32", *channels) for name, channels in SIM_STATE.items()},
+        "sim.seed": _column("int64", "seed"),
+        "next.reward": _column("float32", "reward"),
+        "next.success": _column("bool", "success"),
+        "next.done": _column("bool", "done"),
     }
 
 
 def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
     """The columns of `demonstration_features`, and those that say who was at the wheel."""
     return demonstration_features(task, obs_type) | {
-        "dagger.round": {"dtype": "int64", "shape": (1,), "names": None},
-        "dagger.actor": {"dtype": "string", "shape": (1,), "names": None},
-        "dagger.hopeless": {"dtype": "bool", "shape": (1,), "names": None},
+        "dagger.round": _column("int64", "round"),
+        "dagger.actor": _column("string", "actor"),
+        "dagger.hopeless": _column("bool", "hopeless"),
+    }
+
+
+def as_before_joints(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The same columns as they were before the joints were recorded and every channel had a name."""
+    named = ("observation.", "action", "dart.")
+    return {
+        name: feature if name.startswith(named) else feature | {"names": None}
+        for name, feature in features.items()
+        if name not in JOINT_COLUMNS
     }
 
 
@@ -50,5 +62,5 @@ def _video() -> dict[str, Any]:
     }
 
 
-def _floats(length: int, names: list[str] | None = None) -> dict[str, Any]:
-    return {"dtype": "float32", "shape": (length,), "names": names}
+def _column(dtype: str, *channels: str) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": (len(channels),), "names": list(channels)}

@@ -24,7 +24,10 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class PrivilegedState:
-    """The simulator's state as `contract.SIM_STATE` names it: float arrays, SI units, world frame."""
+    """The simulator's state as `contract.SIM_STATE` names it: float arrays, SI units, world frame.
+
+    Data sets made before the joints were recorded have none of them.
+    """
 
     tcp_pose: np.ndarray
     fingers: np.ndarray
@@ -33,6 +36,8 @@ class PrivilegedState:
     object_mass: np.ndarray
     bin_position: np.ndarray
     bin_interior: np.ndarray
+    joint_positions: np.ndarray | None = None
+    joint_velocities: np.ndarray | None = None
 
     @property
     def tcp(self) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import SIDECAR
@@ -112,7 +113,7 @@ def frame_statistics(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     for name, feature in features.items():
         if feature["dtype"] in ("string", "image", "video"):
             continue
-        paths = sorted((folder / "data").rglob("*.parquet"))
+        paths = (path for path in files_below(folder, "data") if path.suffix == ".parquet")
         column = np.concatenate([np.stack(pd.read_parquet(path, columns=[name])[name]) for path in paths])
         statistics |= compute_episode_stats({name: column.astype(np.float64)}, features)
     return statistics

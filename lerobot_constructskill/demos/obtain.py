@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.demos.recorder import SHARDS, check_disk, write
-from lerobot_constructskill.demos.settings import GenerateConfig, advice_facts, frame_versions, generator_facts
+from lerobot_constructskill.demos.settings import GenerateConfig, code_facts, generator_facts
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ def artifact(config: GenerateConfig) -> Artifact:
         del facts[name]
     light_robot, backend = resolve_rendering(config.light_robot)
     drawn = {"light_robot": light_robot, "render_backend": backend}
-    return Artifact("demonstrations", facts | advice_facts(config) | drawn | {"versions": frame_versions()})
+    return Artifact("demonstrations", facts | code_facts(config) | drawn)
 
 
 def obtain_demonstrations(config: GenerateConfig, store: Store) -> "LeRobotDataset":

@@ -10,6 +10,7 @@ from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
 from lerobot_constructskill.demos.advice import REVISION
+from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.video import VIDEOS
@@ -100,19 +101,21 @@ def generator_facts(config: GenerateConfig) -> dict[str, Any]:
 
 
 def frames_digest(config: GenerateConfig) -> str:
-    """Digest of all settings and versions that a frame depends on, so that shards of two never meet in one data set.
+    """Digest of all that a frame's bytes depend on, so that shards of two kinds never meet in one data set.
 
     What rendered a shard is known when it is there: `merge` refuses a mixture.
     """
     facts = generator_facts(config)
     for name in ("repo_id", "episodes", "max_failures", "seed_start"):
         del facts[name]
-    return digest(facts | advice_facts(config) | {"versions": frame_versions()})
+    return digest(facts | code_facts(config))
 
 
-def advice_facts(config: GenerateConfig) -> dict[str, Any]:
-    """Which advice its labels are, where they are advice."""
-    return {"advice": REVISION} if config.labels == "advice" else {}
+def code_facts(config: GenerateConfig) -> dict[str, Any]:
+    """What a data set depends on beside its settings: encoder, columns, versions, and the advice if it labels."""
+    columns = demonstration_features(get_task(config.task), config.obs_type)
+    facts = {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": frame_versions()}
+    return facts | ({"advice": REVISION} if config.labels == "advice" else {})
 
 
 def frame_versions() -> dict[str, str]:

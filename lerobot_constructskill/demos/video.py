@@ -20,6 +20,9 @@ class Video:
 ONE_THREAD = "pools=none:frame-threads=1:info=0"
 """x265 with more threads, or with its note of the CPU, writes other bytes on another machine."""
 
+CLOSED_GROUPS = "open-gop=0"
+"""By default x265 lets frames refer to a later key frame; LeRobot's default decoder cannot read these at random."""
+
 VIDEOS = {
     "av1": Video(3_000, {"crf": 18}),
     "lossless": Video(
@@ -30,7 +33,7 @@ VIDEOS = {
             "crf": None,
             "g": 10,
             "preset": "ultrafast",
-            "extra_options": {"x265-params": f"lossless=1:log-level=none:{ONE_THREAD}"},
+            "extra_options": {"x265-params": f"lossless=1:log-level=none:{ONE_THREAD}:{CLOSED_GROUPS}"},
         },
     ),
 }

@@ -19,7 +19,13 @@ from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, describe, feature_key, point_key
+from lerobot_constructskill.policies.frozen_vit.features import (
+    PATCHES_FILE,
+    bind_patches,
+    describe,
+    feature_key,
+    point_key,
+)
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
@@ -105,6 +111,7 @@ def write_feature_set(
         if patches:
             of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
             _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
+            bind_patches(folder)
 
 
 def join_feature_sets(
@@ -132,6 +139,7 @@ def join_feature_sets(
         _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder, found)
         if patches:
             _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
+            bind_patches(folder)
 
 
 def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
@@ -223,7 +231,8 @@ def _write_copy(
     with quiet():
         added = {name: (of, columns[name]) for name, of in made.items()}
         copy = modify_features(dataset, added, _left_out(dataset), folder, repo_id)
-    stats = compute_episode_stats(made, columns)
+    # LeRobot takes the variance as a difference of squares, which float32 rounds to nothing far from zero.
+    stats = compute_episode_stats({name: of.astype(np.float64) for name, of in made.items()}, columns)
     write_stats({**(copy.meta.stats or {}), **stats}, folder)
     _forget_videos(folder)
 

@@ -410,11 +410,14 @@ class PickPlaceEnv(BaseEnv):
             "object_mass": [self.object_mass],
             "bin_interior": self.bin_interior,
         }
+        joints = self.agent.robot.get_qpos()
         state = {
             "tcp_pose": self.agent.tcp.pose.raw_pose,
-            "fingers": self.agent.robot.get_qpos()[:, -2:],
+            "fingers": joints[:, -2:],
             "object_pose": self.object.pose.raw_pose,
             "bin_position": self.bin.pose.p,
+            "joint_positions": joints,
+            "joint_velocities": self.agent.robot.get_qvel(),
         }
         for name, value in constants.items():
             state[name] = torch.tensor(value, device=self.device).expand(self.num_envs, -1)

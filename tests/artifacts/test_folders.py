@@ -1,5 +1,6 @@
 """Folders that appear whole or not at all."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,29 @@ def test_a_folder_appears_when_it_is_complete(tmp_path):
         (folder / "rows").write_text("1")
         assert not root.exists()
     assert (root / "rows").read_text() == "1" and [path.name for path in root.parent.iterdir()] == ["set"]
+
+
+def test_whoever_may_read_a_folder_may_read_its_files(tmp_path):
+    before = os.umask(0o027)
+    try:
+        with staged(tmp_path / "set") as folder:
+            folder.mkdir()
+            (folder / "videos").mkdir(mode=0o700)
+            (folder / "videos" / "video.mp4").touch(mode=0o600)  # as `tempfile` makes files
+            (folder / "run.sh").touch(mode=0o700)
+            (tmp_path / "elsewhere").touch(mode=0o600)
+            (folder / "link").symlink_to(tmp_path / "elsewhere")
+    finally:
+        os.umask(before)
+    modes = {path.relative_to(tmp_path).as_posix(): path.stat().st_mode & 0o777 for path in tmp_path.rglob("*")}
+    assert modes == {
+        "set": 0o750,
+        "set/videos": 0o750,
+        "set/videos/video.mp4": 0o640,
+        "set/run.sh": 0o740,
+        "set/link": 0o600,
+        "elsewhere": 0o600,
+    }
 
 
 def test_a_failure_leaves_nothing(tmp_path):

@@ -10,9 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lerobot_constructskill.artifacts.digests import data_sha256
+from lerobot_constructskill.dataset.card import card_facts, render
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
-from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.columns import JOINT_COLUMNS, SIDECAR
 from lerobot_constructskill.errors import InputError
 
 VIDEO = "videos/observation.images.base/chunk-000/file-000.mp4"
@@ -65,14 +67,18 @@ def late_video(root):
         table.to_parquet(path)
 
 
-def frames(change):
+AV1 = ("libsvtav1", {"crf": "18", "preset": "12"})
+OPEN_GROUPS = ("libx265", {"crf": "28", "preset": "ultrafast", "x265-params": "keyint=10:log-level=none"})
+
+
+def frames(change, encoder=AV1):
     """A corruption of the video: `change` takes the list of (H, W, 3) pictures and returns it."""
 
     def corrupt(root):
         with av.open(str(root / VIDEO)) as video:
             pictures = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         with av.open(str(root / VIDEO), "w") as video:
-            stream = video.add_stream("libsvtav1", rate=20, options={"crf": "18", "preset": "12"})
+            stream = video.add_stream(encoder[0], rate=20, options=encoder[1])
             stream.width, stream.height, stream.pix_fmt = 224, 224, "yuv420p"
             for picture in change(pictures):
                 video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
@@ -178,6 +184,7 @@ CORRUPTIONS = {
         "have more frames than",
     ),
     "a truncated video": (truncate(VIDEO), "Videos", "cannot be read"),
+    "open groups of pictures": (frames(list, OPEN_GROUPS), "Reading", "with --dataset.video_backend=pyav"),
     "black pictures": (frames(black), "Pictures", "observation.images.base shows nothing in 10 frames, first 300"),
     "a frozen camera": (frames(frozen), "Pictures", "while the arm moves, first"),
     "a repeated episode": (rows(repeated_episode), "Duplicates", "Episode 8 repeats episode 0"),
@@ -292,6 +299,42 @@ def test_a_set_that_holds_nothing_is_not_opened(corrupt, words, copy):
         open_dataset(copy)
 
 
+def test_a_set_from_before_joints_were_recorded_is_right_as_well_and_its_card_has_what_it_has(copy):
+    def forget(info):
+        for name, feature in list(info["features"].items()):
+            if name in JOINT_COLUMNS:
+                del info["features"][name]
+            elif name.startswith(("phase", "sim.", "next.")):
+                feature["names"] = None
+
+    metadata("meta/info.json", forget)(copy)
+    rows(lambda table: table.drop(columns=list(JOINT_COLUMNS)))(copy)
+    data = open_dataset(copy)
+    assert all(complaints(data, CHECKS[name]) == [] for name in CHECKS if name != "Files")
+    card = render(card_facts(data))
+    assert "`sim.fingers` | float32 | 2 |" in card and "sim.joint" not in card
+    metadata(SIDECAR, lambda facts: facts["generator"].update(labels="advice"))(copy)
+    (complaint,) = complaints(open_dataset(copy), CHECKS["Noise"])
+    assert "advice action" in complaint
+
+
+def test_all_of_a_set_is_as_open_as_its_folder(pristine):
+    access = pristine.stat().st_mode
+    assert access & 0o444 == 0o444, "the umask of these tests hides folders from others"
+    assert not [path for path in pristine.rglob("*") if path.is_file() and path.stat().st_mode & 0o444 != 0o444]
+
+
+@pytest.mark.parametrize("name", ["videos/observation.images.base", "videos", "data"])
+def test_a_folder_that_is_a_link_to_another_disk_is_part_of_the_set(name, pristine, copy, tmp_path):
+    elsewhere = (copy / name).rename(tmp_path / "elsewhere")
+    (copy / name).symlink_to(elsewhere)
+    data = open_dataset(copy)
+    assert [complaints(data, CHECKS[check]) for check in ("Files", "Videos", "Statistics")] == [[], [], []]
+    assert data_sha256(copy) == data_sha256(pristine)
+    next(path for path in elsewhere.rglob("*") if path.is_file()).unlink()
+    assert data_sha256(copy) != data_sha256(pristine)
+
+
 @pytest.mark.parametrize("error", [KeyError, IndexError, ValueError])
 def test_an_error_of_a_check_is_no_fault_of_the_data(error, pristine):
     def broken(data):
@@ -310,7 +353,8 @@ def check(*flags):
 @pytest.mark.slow
 def test_the_command_prints_a_line_for_each_check_and_tells_by_its_status(pristine, copy):
     good = check(f"--root={pristine}")
-    assert good.returncode == 0 and "9 demonstrations, 1108 frames: 13 checks, nothing wrong." in good.stdout
+    counted = f"9 demonstrations, 1108 frames: {len(CHECKS)} checks, nothing wrong."
+    assert good.returncode == 0 and counted in good.stdout
     flip(copy / VIDEO)
     bad = check(f"--root={copy}")
     assert bad.returncode == 1 and f"FAIL  Files         {VIDEO} is not" in bad.stdout

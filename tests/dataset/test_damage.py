@@ -1,5 +1,6 @@
 """Damaged files, each of them in each way: every command that reads a data set says in a sentence which one it is."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,14 @@ def test_a_damaged_file_is_named_by_the_check(damaged, pattern: str, way: str, m
 def test_lerobot_opens_no_damaged_file(damaged, pattern: str, way: str) -> None:
     with pytest.raises((UserError, OSError)):
         open_lerobot("local/toy", damaged(pattern, way))
+
+
+@pytest.mark.parametrize("fps", [10, 30, 20.5, 0, -20])
+def test_a_rate_that_is_not_the_videos_is_refused_by_whoever_reads_them(copy: Path, fps: float) -> None:
+    info = json.loads((copy / "meta/info.json").read_text())
+    (copy / "meta/info.json").write_text(json.dumps(info | {"fps": fps}))
+    with pytest.raises(InputError, match="fps|frames a second"):
+        open_lerobot("local/toy", copy)
 
 
 def test_a_set_that_lerobot_has_edited_is_told_what_it_lacks(copy: Path) -> None:

@@ -94,7 +94,9 @@ def refusal(call, *arguments, **options):
     return str(error.value)
 
 
-def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy):
+def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine, pristine, copy, tmp_path):
+    videos = (copy / "videos").rename(tmp_path / "on a larger disk")
+    (copy / "videos").symlink_to(videos)
     write_card(CardConfig(copy, "bob/before"))  # as a push under another name does
     url = machine(push_dataset, PushConfig("alice/toy", copy, private=True, tag="v1.0"))
     repo = hub.repos["datasets/alice/toy"]

@@ -58,6 +58,8 @@ class ToyEnv:
             "object_mass": [1.365],
             "bin_position": BIN,
             "bin_interior": [0.25, 0.20, 0.15],
+            "joint_positions": [0.1 * self.tcp[0], 0.4, 0, -2, 0, 2.4, 0.8, 0.04, 0.04],
+            "joint_velocities": np.zeros(9),
         }
         return {name: np.array(value, dtype=np.float32) for name, value in state.items()}
 

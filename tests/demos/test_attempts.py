@@ -11,12 +11,15 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_constructskill.artifacts import disk
+from lerobot_constructskill.contract import SIM_STATE
 from lerobot_constructskill.demos import merge, recorder, shards
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.demos.settings import frames_digest
 from lerobot_constructskill.demos.shards import Attempt
+from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError
 
 CONFIG = GenerateConfig("local/set", episodes=6, seed_start=0)
@@ -72,12 +75,28 @@ def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, at
         {"max_steps": 999},
         {"light_robot": False},
         {"labels": "executed"},
+        {"video": "lossless"},
         {"expert": ExpertConfig(gain=0.9)},
         {"noise": NoiseConfig(sigma=0.02)},
     ],
 )
 def test_shards_of_other_settings_are_elsewhere(change):
     assert frames_digest(replace(CONFIG, **change)) != frames_digest(CONFIG)
+
+
+def test_data_of_other_columns_or_another_encoder_is_other_data(monkeypatch):
+    """Or what an earlier version made would count as made, and the shards that it finished be mixed with new ones."""
+    config = replace(CONFIG, video="lossless", light_robot=True)
+    options = VIDEOS["lossless"].encoder | {"g": 20}
+    before = frames_digest(config), artifact(config).digest
+    with monkeypatch.context() as patch:
+        patch.setitem(VIDEOS, "lossless", replace(VIDEOS["lossless"], encoder=options))
+        encoded = frames_digest(config), artifact(config).digest
+    with monkeypatch.context() as patch:
+        patch.delitem(SIM_STATE, "joint_velocities")
+        seen = frames_digest(config), artifact(config).digest
+    assert before == (frames_digest(config), artifact(config).digest)
+    assert all(len({*digests}) == 3 for digests in zip(before, encoded, seen, strict=True))
 
 
 def test_shards_serve_more_episodes_other_names_and_any_number_of_workers():

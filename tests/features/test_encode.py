@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, delete_episodes
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
@@ -23,7 +23,7 @@ from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE
+from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, close_patches, open_patches
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 from lerobot_constructskill.policies.frozen_vit.wheels import Wheel
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
@@ -220,6 +220,36 @@ def test_a_readout_of_patches_trains_on_a_set_that_has_them(source, encoded, wei
     images = torch.stack([source[i]["observation.images.base"] for i in rows])
     seen = policy.predict_action_chunk({"observation.images.base": images})
     torch.testing.assert_close(policy.predict_action_chunk(batch), seen, atol=1e-4, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_patches_of_other_frames_are_refused(source, weights, tmp_path):
+    """Those of the whole set beside an edited one, of an edited one beside the whole, and of as many other frames."""
+    encode(settings(source, weights, tmp_path / "whole", patches=True))
+    whole = LeRobotDataset("local/out", root=tmp_path / "whole")
+    edited = delete_episodes(whole, [0], tmp_path / "edited", "local/edited")
+    patches = np.load(whole.root / PATCHES_FILE)
+    assert open_patches(whole.root).shape == patches.shape
+    for name, rows in {"too many": patches, "as many": patches[LENGTHS[0] :]}.items():
+        root = shutil.copytree(edited.root, tmp_path / name)
+        np.save(root / PATCHES_FILE, rows)
+        with pytest.raises(InputError, match=f"is not of this feature set's {LENGTHS[1]} frames"):
+            make_policy(policy_config(weights, readout="mean"), ds_meta=LeRobotDataset("local/out", root=root).meta)
+    np.save(tmp_path / "whole" / PATCHES_FILE, patches[::-1])
+    close_patches()
+    with pytest.raises(InputError, match="encode the data set again with constructskill-encode --patches=true"):
+        open_patches(whole.root)
+
+
+def test_statistics_of_features_far_from_zero_are_those_of_the_frames(source, weights, tmp_path, monkeypatch):
+    """In float32 a feature near 1000 that moves by hundredths has no spread."""
+    rng = np.random.default_rng(0)
+    pooled = (1000 + 0.01 * rng.normal(size=(sum(LENGTHS), 192))).astype(np.float32)
+    batches = iter(np.split(pooled, [2, 4, 5, 7]))
+    monkeypatch.setattr(features_encode, "_encode", lambda *_: (next(batches), None))
+    encode(settings(source, weights, tmp_path / "out"))
+    found = LeRobotDataset("local/out", root=tmp_path / "out").meta.stats[KEY]["std"]
+    np.testing.assert_allclose(found, pooled.astype(np.float64).std(axis=0), rtol=1e-4)
 
 
 def test_features_of_another_encoder_are_refused(encoded, weights):

@@ -15,7 +15,7 @@ from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quatern
 from mani_skill.utils.structs import Pose
 
 import lerobot_constructskill.sim.register  # noqa: F401
-from lerobot_constructskill.contract import IMAGE_SIZE, LADDER, SIM_STATE, TASKS
+from lerobot_constructskill.contract import IMAGE_SIZE, JOINTS, LADDER, SIM_STATE, TASKS
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim import gpu_physics, scene
@@ -376,8 +376,19 @@ def test_privileged_state_is_what_the_contract_says(blind):
     blind.reset(seed=0)
     state = blind.privileged_state()
     assert {name: value.shape for name, value in state.items()} == {
-        name: (1, length) for name, length in SIM_STATE.items()
+        name: (1, len(channels)) for name, channels in SIM_STATE.items()
     }
+
+
+def test_joints_are_in_the_order_of_their_names_and_velocities_are_the_positions_changes(blind):
+    blind.reset(seed=0)
+    assert tuple(joint.name for joint in blind.agent.robot.active_joints) == JOINTS
+    for direction in (0.3, -0.3):
+        before = blind.privileged_state()["joint_positions"][0, :7].clone()
+        blind.step(np.array([direction, 0, 0, 0, 0, 0, 1], np.float32))
+        after, velocity = (blind.privileged_state()[name][0, :7] for name in ("joint_positions", "joint_velocities"))
+        moves = (after - before).abs() > 0.005
+        assert moves.any() and (torch.sign(velocity) == torch.sign(after - before))[moves].all()
 
 
 def test_the_light_robot_moves_as_the_original_to_the_last_bit(blind):

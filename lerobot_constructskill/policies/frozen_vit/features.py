@@ -1,10 +1,13 @@
 """Feature sets: data sets that carry an encoder's output in place of video, and say whose output it is."""
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -19,6 +22,12 @@ POINT_PREFIX = "observation.points."
 
 PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
+
+INFO = "meta/info.json"
+"""LeRobot's description of a data set's columns."""
+
+BOUND = "patches_sha256"
+"""Name in the description of a feature column: `_identity` of the patch features beside it."""
 
 DESCRIBED = ("backbone", "weights_sha256", "precision", "readout", "preprocessing")
 """What must agree between a feature set and the policy that reads it."""
@@ -39,14 +48,24 @@ def open_patches(root: Path) -> Tensor:
 
     Raises:
         FileNotFoundError: the set was encoded without them.
+        InputError: the file is of other frames, as where the set was edited after it was encoded.
     """
-    file = Path(root) / PATCHES_FILE
-    if not file.exists():
+    root = Path(root)
+    if not (root / PATCHES_FILE).exists():
         raise MissingError(
             f"The feature set in {root} has no {PATCHES_FILE}, which this readout needs: encode the data set with "
             "constructskill-encode --patches=true, or, if it is from the Hub, download it whole and give its folder."
         )
-    return _mapped(file)
+    return _mapped(root)
+
+
+def bind_patches(root: Path) -> None:
+    """Write into a feature set's description which patch features are its own."""
+    path = root / INFO
+    info = json.loads(path.read_text())
+    key = _described_in(info)
+    info["features"][key]["info"][BOUND] = _identity(root, key, np.load(root / PATCHES_FILE, mmap_mode="r"))
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False))
 
 
 def close_patches() -> None:
@@ -55,8 +74,32 @@ def close_patches() -> None:
 
 
 @cache
-def _mapped(file: Path) -> Tensor:
-    return torch.from_numpy(np.load(file, mmap_mode="c"))  # torch takes no read-only memory
+def _mapped(root: Path) -> Tensor:
+    info = json.loads((root / INFO).read_text())
+    key = _described_in(info)
+    patches = np.load(root / PATCHES_FILE, mmap_mode="c")  # torch takes no read-only memory
+    if info["features"][key]["info"].get(BOUND) != _identity(root, key, patches):
+        raise InputError(
+            f"{root / PATCHES_FILE} is not of this feature set's {info['total_frames']} frames, or was written before "
+            "sets said which is theirs: encode the data set again with constructskill-encode --patches=true."
+        )
+    return torch.from_numpy(patches)
+
+
+def _described_in(info: Mapping) -> str:
+    """The column of features that a feature set was encoded to."""
+    return next(name for name in info["features"] if name.startswith(FEATURE_PREFIX))
+
+
+def _identity(root: Path, key: str, patches: np.ndarray) -> str:
+    """What no other set has: the pooled features of all frames, and some rows of their patch features."""
+    files = sorted((root / "data").glob("*/*.parquet"))
+    pooled = np.concatenate([np.stack(pd.read_parquet(file, columns=[key])[key]) for file in files])
+    total = hashlib.sha256(f"{pooled.shape} {patches.shape}".encode())
+    total.update(pooled.tobytes())
+    for row in np.linspace(0, len(patches) - 1, num=16, dtype=int):
+        total.update(patches[row].tobytes())
+    return total.hexdigest()
 
 
 def describe(
