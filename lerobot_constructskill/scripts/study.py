@@ -54,15 +54,13 @@ def study(config: StudyConfig) -> str:
         FileExistsError: another process is running it.
         ValueError: a field of the study cannot be used, or no run succeeded.
     """
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
-
-    register_third_party_plugins()
     from lerobot_constructskill.artifacts.store import Store
+    from lerobot_constructskill.lerobot_internals import load_plugins
     from lerobot_constructskill.study.run import run_study
     from lerobot_constructskill.study.runs import list_runs
     from lerobot_constructskill.study.table import Table, status
 
+    load_plugins()  # a reference may be of another package
     root = (config.root or Path("outputs/study") / config.name).absolute()
     store = Store(config.store.absolute())
     if config.status:
