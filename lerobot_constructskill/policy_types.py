@@ -22,7 +22,7 @@ def decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
         InputError: they do not make one, or no installed package has the type.
     """
     load_plugins()
-    if "type" in fields and fields["type"] not in PreTrainedConfig.get_known_choices():
+    if "type" in fields and fields["type"] not in [*PreTrainedConfig.get_known_choices()]:
         raise _unknown(fields["type"])
     return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
 

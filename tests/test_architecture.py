@@ -65,7 +65,7 @@ ARROWS = {
         "training",
     ),
     "study.execute": ("artifacts", "contract", "dagger", "demos", "envs", "rollout", "training"),
-    "study.validate": ("artifacts", "contract", "demos", "training"),
+    "study.validate": ("artifacts", "contract", "demos", "rollout", "training"),
     "board": ("contract", "perturbations"),
     "board.submission": ("artifacts", "contract", "envs.actions", "envs.recording"),
     "board.collect": ("envs.recording", "study.rows"),

@@ -21,7 +21,8 @@ class StudyConfig(Options, Study):
         root: the study's folder, `outputs/study/<name>` by default: study.yaml, rows.parquet and videos.
         store: where demonstrations, features, checkpoints and runs are made, each once for all studies.
         seeds: cut every variant and reference to this many seeds.
-        status: make nothing; say which runs exist, which are missing, and which failed and why.
+        status: make nothing; say of the runs that `only` asks for which exist, which failed and why, and which would
+            be made and how long that takes, as far as it is known.
     """
 
     analysis: Analysis = field(default_factory=Analysis)
@@ -56,15 +57,17 @@ def study(config: StudyConfig) -> str:
     """
     from lerobot_constructskill.artifacts.store import Store
     from lerobot_constructskill.lerobot_internals import load_plugins
-    from lerobot_constructskill.study.run import run_study
+    from lerobot_constructskill.study.run import choose, run_study
     from lerobot_constructskill.study.runs import list_runs
-    from lerobot_constructskill.study.table import Table, status
+    from lerobot_constructskill.study.status import status
+    from lerobot_constructskill.study.table import Table
 
     load_plugins()  # a reference may be of another package
     root = (config.root or Path("outputs/study") / config.name).absolute()
     store = Store(config.store.absolute())
     if config.status:
-        return status(Table(root, list_runs(config.study), store))
+        runs = list_runs(config.study)
+        return status(Table(root, runs, store), choose(runs, config.only), config.retry_failed)
     table = run_study(config.study, _text(config), root, store, config)
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)

@@ -31,7 +31,7 @@ from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
-from lerobot_constructskill.study.timing import timed
+from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
 
@@ -77,7 +77,7 @@ def make_runs(job: Job) -> Iterator[Run]:
 
 def obtain(job: Job, demonstrations: Demonstrations) -> LeRobotDataset:
     """The data set of some demonstrations, made if it is not there."""
-    with timed(job.times, "demonstrations"):
+    with timed(job.times, DEMONSTRATIONS):
         return obtain_demonstrations(replace(demonstrations.config, workers=job.workers), job.store)
 
 
@@ -125,7 +125,7 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
     training = arm.training
     if arm.dagger:
         for run in runs:
-            with timed(job.times, "rounds of DAgger"):
+            with timed(job.times, ROUNDS, arm.id):
                 plan = Plan(replace(run.dagger.config, workers=job.workers))
                 make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
@@ -133,7 +133,7 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
     writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
-    with timed(job.times, "encoding and training"):
+    with timed(job.times, TRAINING, arm.id, len(runs)):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
 
 
@@ -152,7 +152,7 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
     filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
     film = FirstEpisode(next(iter(filmed), None))
-    with timed(job.times, "evaluation"):
+    with timed(job.times, EVALUATION, arm.id, len(runs)):
         starts = range(first, first + count)
         for number, rollout in roll_out(agents, arm.env, starts, on_step=film.add, filmed=filmed):
             if rollout.error is not None:

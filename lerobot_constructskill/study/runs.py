@@ -105,6 +105,10 @@ class Arm:
     elsewhere: tuple["Arm", ...] = ()
 
     @property
+    def id(self) -> str:
+        return f"{self.setting}/{self.name}"
+
+    @property
     def trained_on(self) -> Demonstrations | None:
         """The demonstrations that are all it is trained on; none where DAgger adds rounds to them.
 
@@ -122,7 +126,7 @@ class Run:
 
     @property
     def id(self) -> str:
-        return f"{self.arm.setting}/{self.arm.name}/seed_{self.seed}"
+        return f"{self.arm.id}/seed_{self.seed}"
 
     @cached_property
     def dagger(self) -> Plan | None:

@@ -54,7 +54,8 @@ class Trainer:
     heldout_mse: Callable[..., list[float | None]] | None = None
     """`(config, checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on
     episodes of other demonstrations, in m2; None where they lack one of its inputs. `config` says where things lie and
-    compute now. Without it, none is validated on others."""
+    compute now. A trainer that has it tells its writers the error on its own demonstrations. For all others a study
+    measures both with the checkpoint, as any policy's (`rollout/heldout.py`)."""
 
     def seeds_together(self, config: PreTrainedConfig) -> bool:
         """Whether `fit` should get many seeds at once. Where it raises, those failed that it has not written."""

@@ -25,7 +25,8 @@ from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, R
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
-from lerobot_constructskill.study.table import Table, status
+from lerobot_constructskill.study.status import status
+from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import TIMINGS, seconds_by_stage, timed
 from lerobot_constructskill.study.validate import list_pairs
 from lerobot_constructskill.training.checkpoints import FACTS
@@ -460,7 +461,7 @@ def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
     table.write()
     rows = read_rows(tmp_path / "rows.parquet")
     assert set(rows["error_kind"]) == {NOT_RUN} and len(rows) == 7 and set(rows["episodes"]) == {2}
-    assert "fixed/a: 0 finished, 0 failed, 3 missing" in status(table).splitlines()
+    assert "fixed/a: 0 finished, 0 failed, 3 missing" in status(table, table.runs).splitlines()
 
 
 def test_runs_that_are_something_else_are_one_sentence(tmp_path):
