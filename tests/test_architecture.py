@@ -199,6 +199,15 @@ def test_listed_externals_only(module: str) -> None:
     assert names <= EXTERNALS[row(module, EXTERNALS)] | set(sys.stdlib_module_names)
 
 
+def test_a_policy_is_read_through_the_door_that_loads_plugins() -> None:
+    """Whoever read one by LeRobot alone would not know the policies of others, unless they were imported before."""
+    by_lerobot = ("PreTrainedConfig.from_pretrained", "decode(PreTrainedConfig", "register_third_party_plugins()")
+    texts = {module: path.read_text() for module, path in SOURCES.items()}
+    readers = {module for module, text in texts.items() if any(one in text for one in by_lerobot)}
+    doctor = f"{PACKAGE}.scripts.doctor"  # whose script looks at LeRobot's own discovery
+    assert readers == {f"{PACKAGE}.policy_types", doctor}
+
+
 def test_no_room_meets_environments_and_policies() -> None:
     rooms = {
         module: {room(found.target) for found in imports(path) if is_ours(found.target)}

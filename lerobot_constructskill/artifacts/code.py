@@ -26,20 +26,19 @@ def code_of(*things: Any) -> dict[str, str]:
 
     LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
     a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every Python file of the top-level package, and of
-    packages that it imports and that are part of the same distribution, or of none that is installed as one.
+    packages that it imports and that are part of the same distribution, or of none.
     """
     packages = {thing.__module__.partition(".")[0] for thing in things} - BY_VERSION
-    return dict(_code_of_package(package) for package in sorted(packages) if _files(package))
+    return dict(_told(package) for package in sorted(packages) if _files(package))
 
 
-@cache  # what a process has imported stays as it is
-def _code_of_package(package: str) -> tuple[str, str]:
+def _told(package: str) -> tuple[str, str]:
     name = _distribution(package) or package
-    source = f"source {source_sha256(package)[:12]}"
+    source = f"source {_source_sha256(package)[:12]}"
     return name, f"{version}, {source}" if (version := installed(name)) else source
 
 
-def source_sha256(package: str) -> str:
+def _source_sha256(package: str) -> str:
     """Hash the names and bytes of the source of a package, and of those that belong to it, as it is now."""
     total = hashlib.sha256()
     for name in sorted(_with_helpers(package)):

@@ -55,7 +55,7 @@ def study(config: StudyConfig) -> str:
         FileExistsError: another process is running it.
         ValueError: a field of the study cannot be used, or no run succeeded.
     """
-    from lerobot_constructskill.artifacts.store import Store
+    from lerobot_constructskill.artifacts.store import LOG, Store
     from lerobot_constructskill.lerobot_internals import load_plugins
     from lerobot_constructskill.study.run import choose, run_study
     from lerobot_constructskill.study.runs import list_runs
@@ -72,7 +72,8 @@ def study(config: StudyConfig) -> str:
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
-        raise InputError(f"No run succeeded; the first of {made} failed with: {table.episodes(failed[0])[0].error}")
+        why, log = table.episodes(failed[0])[0].error, store.folder(failed[0].artifact) / LOG
+        raise InputError(f"No run succeeded; the first of {made} failed with: {why} (log: {log})")
     lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
     left = f", {len(missing)} missing" if missing else ""
     return f"{plural(made, 'run')}{lacking}{left}: {root} (next: constructskill-report --root={root})"

@@ -6,12 +6,14 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import httpx
 from lerobot.datasets import LeRobotDataset
@@ -33,7 +35,7 @@ from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
+from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of, versions_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
@@ -130,11 +132,29 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
                 make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
+    writers = {run.seed: partial(_writing_checkpoint, job.store, run) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
     with timed(job.times, TRAINING, arm.id, len(runs)):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
+
+
+@contextmanager
+def _writing_checkpoint(store: Store, run: Run, **facts: Any) -> Iterator[Path]:
+    with writing_checkpoint(store, run.checkpoint, **facts) as folder:
+        yield folder
+        _check_unedited(run)
+
+
+def _check_unedited(run: Run) -> None:
+    """Let nothing be written under the name of what a policy was before somebody edited it.
+
+    Raises:
+        MachineError: its code is not what it was when the study began.
+    """
+    now = versions_of(run.arm.policy) if run.arm.policy else {}
+    if edited := [name for name, code in now.items() if run.versions.get(name) != code]:
+        raise MachineError(f"{edited[0]} was edited while {run.id} was made; the same command makes it as it is now.")
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
@@ -159,6 +179,7 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
                 _let_through(rollout.error)
                 yield _write_failed(job, runs[number], rollout.error)
             else:
+                _check_unedited(runs[number])
                 yield _write_finished(job, runs[number], rollout, partial(film.write, number))
 
 

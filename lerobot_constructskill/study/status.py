@@ -47,7 +47,7 @@ def _changed(table: Table, run: Run) -> str | None:
     row = table.outdated(run)
     if row is None:
         return None
-    before = json.loads(row.versions or "{}")
+    before = json.loads(row.versions) if row.versions else run.versions
     return ", ".join(name for name, now in run.versions.items() if before.get(name) != now) or "specification"
 
 
