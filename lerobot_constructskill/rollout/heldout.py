@@ -33,9 +33,9 @@ def heldout_mse(
     ends = _ends(dataset, episodes)
     if not ends:
         return None
-    frames = (
-        [*ends] if len(ends) <= FRAMES else [[*ends][i] for i in np.linspace(0, len(ends) - 1, FRAMES).astype(int)]
-    )
+    frames = [*ends]
+    if len(frames) > FRAMES:
+        frames = [frames[number] for number in np.linspace(0, len(frames) - 1, FRAMES).astype(int)]
     agent = PolicyAgent.from_pretrained(checkpoint, device)
     check_actions(agent.policy, dataset)
     view = Subset(observed(dataset, agent.policy), frames)

@@ -179,7 +179,6 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
                 _let_through(rollout.error)
                 yield _write_failed(job, runs[number], rollout.error)
             else:
-                _check_unedited(runs[number])
                 yield _write_finished(job, runs[number], rollout, partial(film.write, number))
 
 
@@ -215,6 +214,7 @@ def _write(
     write_video: Callable[[Path], None] = lambda path: None,
     recordings: Sequence[Recording] = (),
 ) -> Run:
+    _check_unedited(run)
     with job.store.writing(run.artifact) as folder:
         folder.mkdir()
         write_rows(rows, folder / EPISODES, EpisodeRow)

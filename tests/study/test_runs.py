@@ -511,7 +511,9 @@ def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, 
     with refused, execute._writing_checkpoint(store, run) as folder:
         folder.mkdir()
         edit("source b")
-    assert not store.has(run.checkpoint) and run.artifact.digest == digest
+    with refused:
+        execute._write_failed(Job((run,), store, tmp_path), run, ValueError("of a half-written line"))
+    assert not store.has(run.checkpoint) and not store.has(run.artifact) and run.artifact.digest == digest
 
 
 def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
