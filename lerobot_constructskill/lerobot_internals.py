@@ -7,6 +7,7 @@ tests/test_lerobot_internals.py holds both rules, and says in a sentence each wh
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -63,6 +64,12 @@ def __getattr__(name: str) -> Any:
 def _with_parents(module: str) -> list[str]:
     parts = module.split(".")
     return [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
+
+
+@cache
+def load_plugins() -> None:
+    """Import the installed LeRobot plugins, ours among them, once: they register policies and references."""
+    __getattr__("register_third_party_plugins")()
 
 
 def largest_rewards(eval_info: dict[str, Any]) -> list[float]:

@@ -24,6 +24,7 @@ ARROWS = {
     "presets": (),
     "tags": ("presets",),
     "parsing": ("presets", "tags"),
+    "policy_types": ("parsing",),
     "other_tasks": (),
     "contract": ("other_tasks",),
     "cameras": ("contract",),
@@ -42,22 +43,32 @@ ARROWS = {
     "demos.shards": ("artifacts", "contract", "envs"),
     "dataset": ("artifacts", "contract", "demos", "interface", "parsing"),
     "dataset.replay": ("contract", "demos", "envs"),
-    "features": ("artifacts", "cameras", "contract", "policies"),
+    "features": ("artifacts", "cameras", "contract", "policies", "policy_types"),
     "rollout": ("contract",),
-    "rollout.agents": ("contract", "parsing"),
+    "rollout.agents": ("contract", "policy_types"),
     "rollout.lockstep": ("contract", "envs"),
     "rollout.references": ("contract", "demos"),
     "rollout.simulators": ("artifacts", "envs"),
     "training": ("artifacts",),
-    "training.checkpoints": ("artifacts", "contract", "parsing"),
+    "training.checkpoints": ("artifacts", "contract", "policy_types"),
     "training.recipe": ("contract",),
     "dagger": ("artifacts", "contract", "demos", "envs", "parsing", "rollout", "training"),
     "study": ("artifacts", "training"),
     "study.rows": ("artifacts",),
     "study.spec": ("artifacts", "training"),
-    "study.runs": ("artifacts", "contract", "dagger", "demos", "envs", "parsing", "rollout", "training"),
+    "study.runs": (
+        "artifacts",
+        "contract",
+        "dagger",
+        "demos",
+        "envs",
+        "parsing",
+        "policy_types",
+        "rollout",
+        "training",
+    ),
     "study.execute": ("artifacts", "contract", "dagger", "demos", "envs", "rollout", "training"),
-    "study.validate": ("artifacts", "contract", "demos", "training"),
+    "study.validate": ("artifacts", "contract", "demos", "rollout", "training"),
     "board": ("contract", "perturbations"),
     "board.submission": ("artifacts", "contract", "envs.actions", "envs.recording"),
     "board.collect": ("envs.recording", "study.rows"),
@@ -87,6 +98,7 @@ ARROWS = {
         "perturbations",
         "plugin",
         "policies",
+        "policy_types",
         "presets",
         "rollout",
         "sim",
@@ -197,6 +209,15 @@ def test_simulator_stays_in_its_room(module: str) -> None:
 def test_listed_externals_only(module: str) -> None:
     names = {found.target.split(".")[0] for found in imports(SOURCES[module]) if not is_ours(found.target)}
     assert names <= EXTERNALS[row(module, EXTERNALS)] | set(sys.stdlib_module_names)
+
+
+def test_a_policy_is_read_through_the_door_that_loads_plugins() -> None:
+    """Whoever read one by LeRobot alone would not know the policies of others, unless they were imported before."""
+    by_lerobot = ("PreTrainedConfig.from_pretrained", "decode(PreTrainedConfig", "register_third_party_plugins()")
+    texts = {module: path.read_text() for module, path in SOURCES.items()}
+    readers = {module for module, text in texts.items() if any(one in text for one in by_lerobot)}
+    doctor = f"{PACKAGE}.scripts.doctor"  # whose script looks at LeRobot's own discovery
+    assert readers == {f"{PACKAGE}.policy_types", doctor}
 
 
 def test_no_room_meets_environments_and_policies() -> None:

@@ -45,6 +45,12 @@ NOT_RUN = {
     "lerobot-eval --policy.path=outputs/smolvla": "needs its weights: tests/test_any_policy.py has random ones",
     "python examples/vla_evaluation_harness": "serves until it is killed: tests/test_vla_evaluation_harness.py",
     "PYTHONPATH=examples/vla_evaluation_harness": "asks that server",
+    "lerobot-train --policy.type=tinybc": "needs that plugin installed: tests/test_your_policy.py goes its whole way",
+    "lerobot-eval --policy.path=outputs/tinybc": "of that policy",
+    "constructskill-generate precise/brick_on_brick --episodes=16": "for that policy",
+    "constructskill-study mine.yaml": "of that policy, from a file that the reader writes",
+    "constructskill-report --root=outputs/study/mine": "of that study",
+    "constructskill-offline --policies='[outputs/store/runs": "of that study",
     "constructskill-compare 'outputs/mine": "needs seeds of the reader: tests/comparison/test_checkpoints.py",
     "constructskill-check-task --task=lintel_to_wall": "a task of the reader's: tests/test_other_packages.py",
 }

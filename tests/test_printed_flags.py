@@ -86,8 +86,15 @@ def test_flags_of_ours_are_known(command: str, parsing_alone, monkeypatch, tmp_p
     assert parsed.value.args == ()
 
 
+@pytest.fixture
+def example(monkeypatch) -> None:
+    """The plugin of docs/your_policy.md is imported, as LeRobot does it where it is installed."""
+    monkeypatch.syspath_prepend(ROOT / "examples" / "your_policy")
+    import_module("lerobot_policy_tinybc")
+
+
 @pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in THEIRS])
-def test_fields_of_lerobots_are_known(command: str, monkeypatch, tmp_path) -> None:
+def test_fields_of_lerobots_are_known(command: str, example, monkeypatch, tmp_path) -> None:
     monkeypatch.setattr(sys, "argv", words(command, tmp_path))
     checkpoint = FrozenViTChunkConfig(device="cpu")  # in place of one that an earlier command makes
     monkeypatch.setattr(PreTrainedConfig, "from_pretrained", lambda *_, **__: checkpoint)

@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Iterator
 from functools import cache
-from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -59,11 +59,3 @@ def installed(package: str) -> str | None:
 def versions(*packages: str) -> dict[str, str]:
     """Those of some packages that are installed, with their versions."""
     return {package: found for package in packages if (found := installed(package))}
-
-
-def distributions_of(thing: Any) -> tuple[str, ...]:
-    """The installed distributions that a class or function comes from."""
-    return tuple(_distributions().get(thing.__module__.split(".")[0], ()))
-
-
-_distributions = cache(packages_distributions)

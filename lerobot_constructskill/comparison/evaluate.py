@@ -5,7 +5,7 @@ from itertools import batched
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.artifacts.digests import distributions_of, versions
+from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.comparison.sides import MAKER, Conditions, Side, merge_versions
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
@@ -13,6 +13,7 @@ from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.training.checkpoints import LEARNING, check_inputs
+from lerobot_constructskill.training.trainers import versions_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
 
@@ -45,7 +46,7 @@ def evaluate(
     for group in batched(checkpoints, together):  # noqa: B911  the last one may be smaller
         for checkpoint, agent, rollout in _roll_out(group, env, starts, device):
             seeds.append({episode.evaluation_seed: episode.placed for episode in rollout.episodes})
-            packages = versions(*ACTING, *distributions_of(type(agent.policy.config)))
+            packages = versions(*ACTING) | versions_of(agent.policy.config)
             told.append(packages | {"processor": processor(), MAKER: make(), "backend": rollout.backend})
             if kept_in is not None:
                 _keep(rollout, env, kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}")

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils import OBS_STATE
@@ -39,6 +38,7 @@ from lerobot_constructskill.policies.frozen_vit.train_seeds import (
     with_heads,
 )
 from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load_weights
+from lerobot_constructskill.policy_types import read_policy
 from lerobot_constructskill.progress import Progress, quiet
 
 
@@ -138,8 +138,7 @@ class FeatureTrainer:
         held_out: Sequence[int],
         store: Store,
     ) -> float | None:
-        saved = PreTrainedConfig.from_pretrained(checkpoint)
-        policy = FrozenViTChunkPolicy.from_pretrained(checkpoint, config=replace(saved, **here))
+        policy = FrozenViTChunkPolicy.from_pretrained(checkpoint, config=replace(read_policy(checkpoint), **here))
         if policy.config.use_state and OBS_STATE not in demonstrations.meta.features:
             return None
         features = obtain_features(policy.config, demonstrations, store)

@@ -9,13 +9,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
 
 from lerobot_constructskill.contract import CAMERAS
 from lerobot_constructskill.errors import InputError, UserError
-from lerobot_constructskill.parsing import as_input
+from lerobot_constructskill.policy_types import read_policy
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class PolicyAgent:
 
     @classmethod
     def from_pretrained(cls, checkpoint: Path | str, device: str | None = None, **overrides: Any) -> "PolicyAgent":
-        """Load a checkpoint folder, or a name on the Hub, of any registered policy type.
+        """Load a checkpoint folder, or a name on the Hub, of any policy type that is installed.
 
         Args:
             overrides: fields of its configuration, in place of its own where they are not None.
@@ -72,9 +71,7 @@ class PolicyAgent:
             ValueError: its configuration cannot be read, or is of an unknown type.
             OSError: there is no such checkpoint.
         """
-        with as_input():
-            flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
-            config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
+        config = read_policy(checkpoint, **overrides)
         if config.use_peft:
             raise InputError(f"'{checkpoint}' is a PEFT adapter; merge it into its policy first.")
         config.device = device or config.device

@@ -169,7 +169,7 @@ def predict(
             policy.reset()
             batches = []
             for batch in DataLoader(Subset(dataset, span), batch_size):
-                batches.append(_chunks(policy, preprocess, postprocess, batch))
+                batches.append(ask(policy, preprocess, postprocess, batch))
                 bar.update(len(batch["action"]))
             labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
             predictions.append(Predictions(labels, chunks))
@@ -177,8 +177,14 @@ def predict(
 
 
 @torch.inference_mode()
-def _chunks(policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict) -> tuple:
-    """Labels (B, A) and chunks (B, C, A) of a batch."""
+def ask(
+    policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Labels (B, A) of a batch, and chunks (B, C, A) that a policy predicts; C is 1 where it predicts none.
+
+    Raises:
+        InputError: it makes its chunks from a queue of past observations.
+    """
     seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
     seen = preprocess(seen | {name: batch[name] for name in ("task", "index")})
     try:

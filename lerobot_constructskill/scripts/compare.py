@@ -107,10 +107,6 @@ def compare(config: CompareConfig) -> str:
 def _evaluate(
     config: CompareConfig, found: "Found", env: Mapping[str, Any], starts: Sequence[int], side: str
 ) -> "Side":
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
-
-    register_third_party_plugins()
     from lerobot_constructskill.comparison.evaluate import evaluate
 
     kept_in = config.out and config.out / side

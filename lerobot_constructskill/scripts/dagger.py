@@ -15,10 +15,6 @@ def dagger(config: DaggerConfig) -> str:
         ValueError: a field cannot be used.
         OSError: the disk is full, this machine cannot render, or a process died.
     """
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
-
-    register_third_party_plugins()
     from lerobot_constructskill.artifacts.store import Store
     from lerobot_constructskill.dagger.plan import Plan
     from lerobot_constructskill.dagger.run import run_dagger

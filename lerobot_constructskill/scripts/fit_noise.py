@@ -44,7 +44,6 @@ def fit_noise(config: FitNoiseConfig) -> str:
     import yaml
     from lerobot.utils import auto_select_torch_device
 
-    import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.dataset.dataset import read_provenance
     from lerobot_constructskill.dataset.hub import choose_held_out, one_sentence, open_lerobot
     from lerobot_constructskill.demos.dart import fit_covariance

@@ -89,7 +89,6 @@ def _find(patterns: list[str]) -> list[Path]:
 def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) -> dict:
     import torch
 
-    import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.rollout.agents import PolicyAgent
     from lerobot_constructskill.rollout.offline import check_actions, observed, offline_metrics, predict, shown
 

@@ -55,13 +55,12 @@ def _read(path: Path) -> dict:
 def _push(config: PushPolicyConfig, section: str, device: str | None) -> None:
     """Load it on any machine, and push it as it is: with the device that it was trained on."""
     from huggingface_hub import HfApi, ModelCard
-    from lerobot.configs import PreTrainedConfig
     from lerobot.policies import get_policy_class
 
-    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig, register_third_party_plugins
+    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig
+    from lerobot_constructskill.policy_types import read_policy
 
-    register_third_party_plugins()
-    policy_config = PreTrainedConfig.from_pretrained(config.policy_path)
+    policy_config = read_policy(config.policy_path)
     policy_config.repo_id, policy_config.private, policy_config.device = config.repo_id, config.private, "cpu"
     policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
     policy.config.device = device

@@ -21,7 +21,8 @@ class StudyConfig(Options, Study):
         root: the study's folder, `outputs/study/<name>` by default: study.yaml, rows.parquet and videos.
         store: where demonstrations, features, checkpoints and runs are made, each once for all studies.
         seeds: cut every variant and reference to this many seeds.
-        status: make nothing; say which runs exist, which are missing, and which failed and why.
+        status: make nothing; say of the runs that `only` asks for which exist, which failed and why, and which would
+            be made and how long that takes, as far as it is known.
     """
 
     analysis: Analysis = field(default_factory=Analysis)
@@ -54,24 +55,25 @@ def study(config: StudyConfig) -> str:
         FileExistsError: another process is running it.
         ValueError: a field of the study cannot be used, or no run succeeded.
     """
-    import lerobot_constructskill.plugin  # noqa: F401
-    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
-
-    register_third_party_plugins()
-    from lerobot_constructskill.artifacts.store import Store
-    from lerobot_constructskill.study.run import run_study
+    from lerobot_constructskill.artifacts.store import LOG, Store
+    from lerobot_constructskill.lerobot_internals import load_plugins
+    from lerobot_constructskill.study.run import choose, run_study
     from lerobot_constructskill.study.runs import list_runs
-    from lerobot_constructskill.study.table import Table, status
+    from lerobot_constructskill.study.status import status
+    from lerobot_constructskill.study.table import Table
 
+    load_plugins()  # a reference may be of another package
     root = (config.root or Path("outputs/study") / config.name).absolute()
     store = Store(config.store.absolute())
     if config.status:
-        return status(Table(root, list_runs(config.study), store))
+        runs = list_runs(config.study)
+        return status(Table(root, runs, store), choose(runs, config.only), config.retry_failed)
     table = run_study(config.study, _text(config), root, store, config)
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
-        raise InputError(f"No run succeeded; the first of {made} failed with: {table.episodes(failed[0])[0].error}")
+        why, log = table.episodes(failed[0])[0].error, store.folder(failed[0].artifact) / LOG
+        raise InputError(f"No run succeeded; the first of {made} failed with: {why} (log: {log})")
     lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
     left = f", {len(missing)} missing" if missing else ""
     return f"{plural(made, 'run')}{lacking}{left}: {root} (next: constructskill-report --root={root})"

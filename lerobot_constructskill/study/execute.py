@@ -6,12 +6,14 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import httpx
 import torch
@@ -32,9 +34,9 @@ from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
-from lerobot_constructskill.study.timing import timed
+from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
+from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of, versions_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
@@ -78,7 +80,7 @@ def make_runs(job: Job) -> Iterator[Run]:
 
 def obtain(job: Job, demonstrations: Demonstrations) -> LeRobotDataset:
     """The data set of some demonstrations, made if it is not there."""
-    with timed(job.times, "demonstrations"):
+    with timed(job.times, DEMONSTRATIONS):
         return obtain_demonstrations(replace(demonstrations.config, workers=job.workers), job.store)
 
 
@@ -126,16 +128,34 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
     training = arm.training
     if arm.dagger:
         for run in runs:
-            with timed(job.times, "rounds of DAgger"):
+            with timed(job.times, ROUNDS, arm.id):
                 plan = Plan(replace(run.dagger.config, workers=job.workers))
                 make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint) for run in runs}
+    writers = {run.seed: partial(_writing_checkpoint, job.store, run) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
-    with timed(job.times, "encoding and training"):
+    with timed(job.times, TRAINING, arm.id, len(runs)):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
+
+
+@contextmanager
+def _writing_checkpoint(store: Store, run: Run, **facts: Any) -> Iterator[Path]:
+    with writing_checkpoint(store, run.checkpoint, **facts) as folder:
+        yield folder
+        _check_unedited(run)
+
+
+def _check_unedited(run: Run) -> None:
+    """Let nothing be written under the name of what a policy was before somebody edited it.
+
+    Raises:
+        MachineError: its code is not what it was when the study began.
+    """
+    now = versions_of(run.arm.policy) if run.arm.policy else {}
+    if edited := [name for name, code in now.items() if run.versions.get(name) != code]:
+        raise MachineError(f"{edited[0]} was edited while {run.id} was made; the same command makes it as it is now.")
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
@@ -153,7 +173,7 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
     filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
     film = FirstEpisode(next(iter(filmed), None))
-    with timed(job.times, "evaluation"):
+    with timed(job.times, EVALUATION, arm.id, len(runs)):
         starts = range(first, first + count)
         for number, rollout in roll_out(agents, arm.env, starts, on_step=film.add, filmed=filmed):
             if rollout.error is not None:
@@ -198,6 +218,7 @@ def _write(
     write_video: Callable[[Path], None] = lambda path: None,
     recordings: Sequence[Recording] = (),
 ) -> Run:
+    _check_unedited(run)
     with job.store.writing(run.artifact) as folder:
         folder.mkdir()
         write_rows(rows, folder / EPISODES, EpisodeRow)

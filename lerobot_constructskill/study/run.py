@@ -17,6 +17,7 @@ from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.execute import Job, make_runs
 from lerobot_constructskill.study.rows import PROVENANCE, STUDY
@@ -130,10 +131,8 @@ def _noted(stopped: list[Exception]) -> Iterator[None]:
 
 
 def _make_all(job: Job) -> list[Run]:
-    from lerobot_constructskill.lerobot_internals import register_third_party_plugins
-
     flush_denormals()
-    register_third_party_plugins()  # another machine knows neither our policy nor other packages' yet
+    load_plugins()  # another machine does not know other packages' references yet
     return list(make_runs(job))
 
 

@@ -9,7 +9,8 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 
-from lerobot_constructskill.artifacts.digests import distributions_of, versions
+from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.plan import Plan
@@ -19,6 +20,7 @@ from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
+from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import SHARED, Study, Variant
@@ -26,12 +28,11 @@ from lerobot_constructskill.training.checkpoints import (
     LEARNING,
     check_inputs,
     checkpoint_artifact,
-    decode_policy,
     settle_policy,
     settled_elsewhere,
 )
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import packages_of
+from lerobot_constructskill.training.trainers import versions_of
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
@@ -104,6 +105,10 @@ class Arm:
     elsewhere: tuple["Arm", ...] = ()
 
     @property
+    def id(self) -> str:
+        return f"{self.setting}/{self.name}"
+
+    @property
     def trained_on(self) -> Demonstrations | None:
         """The demonstrations that are all it is trained on; none where DAgger adds rounds to them.
 
@@ -121,7 +126,7 @@ class Run:
 
     @property
     def id(self) -> str:
-        return f"{self.arm.setting}/{self.arm.name}/seed_{self.seed}"
+        return f"{self.arm.id}/seed_{self.seed}"
 
     @cached_property
     def dagger(self) -> Plan | None:
@@ -155,10 +160,9 @@ class Run:
 
     @cached_property
     def versions(self) -> dict[str, str]:
-        """Of the packages that may show in its episodes."""
+        """What the packages are that may show in its episodes."""
         policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
-        own = packages_of(policy) if policy else distributions_of(reference.agent)
-        return versions(*ACTING, *own)
+        return versions(*ACTING) | (versions_of(policy) if policy else code_of(reference.agent))
 
     def heldout(self, demonstrations: Demonstrations) -> Artifact:
         """Its translation error on what is held out of some demonstrations."""

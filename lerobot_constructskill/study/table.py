@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.store import LOG, Store
+from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
-from lerobot_constructskill.study.runs import Demonstrations, Run
+from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.spec import video_path
 from lerobot_constructskill.study.validate import read_error
-from lerobot_constructskill.training.checkpoints import read_facts
 
 HELDOUT = ("heldout_mse_m2", "heldout_mse_m2_by_data")
 """Columns of `Row` that follow from a run's checkpoint: on the setting's own demonstrations, and on each by name."""
@@ -69,6 +68,12 @@ class Table:
         """The rows of a run that the table in the folder had, if it ran to its end, or if it failed."""
         kept = (self._kept[key] for key in _keys(run) if key in self._kept)
         return next((rows for rows in kept if bool(rows[0].error_kind) == failed), None)
+
+    def outdated(self, run: Run) -> Row | None:
+        """A row that the table in the folder had of this run, made of something else than it would be made of now."""
+        ours = _keys(run)
+        alike = (rows[0] for key, rows in self._kept.items() if key[:2] == ours[0][:2] and key not in ours)
+        return next((row for row in alike if row.training_seed == run.seed), None)
 
     def lost(self) -> list[str]:
         """The runs of the table in the folder that neither this study nor the store has.
@@ -132,15 +137,10 @@ class Table:
         if not self.store.has(run.checkpoint):
             kept = self._kept_rows(run)
             return {name: getattr(kept[0], name) for name in HELDOUT} if kept else {}
-        errors = {data.name: self._heldout_error(run, data) for data in run.arm.validated_on}
+        errors = {data.name: read_error(run, data, self.store) for data in run.arm.validated_on}
         errors = {name: error for name, error in errors.items() if error is not None}
         own, every = HELDOUT
         return {own: errors.get(run.arm.validated_on[0].name), every: json.dumps(errors)} if errors else {}
-
-    def _heldout_error(self, run: Run, data: Demonstrations) -> float | None:
-        if data == run.arm.trained_on:
-            return read_facts(self.store.folder(run.checkpoint)).get("heldout_mse_m2")
-        return read_error(run, data, self.store)
 
     def _video(self, run: Run) -> str | None:
         """Copy the run's video beside the table and return its path there."""
@@ -180,20 +180,3 @@ def _names(run: Run) -> dict[str, Any]:
         "episodes": arm.evaluation["episodes"],
         "demonstrations": arm.demonstrations and arm.demonstrations.name,
     }
-
-
-def status(table: Table) -> str:
-    """A line for every variant and reference of every setting, and one for every reason of a failure."""
-    lines = []
-    for (setting, name), runs in groupby(table.runs, key=lambda run: (run.arm.setting, run.arm.name)):
-        runs = list(runs)
-        made = [(run, rows[0]) for run in runs if (rows := table.episodes(run))]
-        failed = [(run, row) for run, row in made if row.error_kind]
-        finished, missing = len(made) - len(failed), len(runs) - len(made)
-        lines.append(f"{setting}/{name}: {finished} finished, {len(failed)} failed, {missing} missing")
-        for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
-            (first, _), *others = alike
-            seeds = ", ".join(str(run.seed) for run in (first, *(run for run, _ in others)))
-            log = table.store.folder(first.artifact) / LOG
-            lines.append(f"    seeds {seeds} ({kind}): {error} (log: {log})")
-    return "\n".join(lines)

@@ -3,18 +3,29 @@
 import json
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 TIMINGS = "timings.jsonl"
 
+DEMONSTRATIONS, TRAINING, EVALUATION = "demonstrations", "encoding and training", "evaluation"
+ROUNDS = "rounds of DAgger"
+"""The stages of a study; with rounds, training is part of them."""
+
 
 @contextmanager
-def timed(root: Path, stage: str) -> Iterator[None]:
-    """Add the seconds that the block takes to `stage`; work of a killed process is not counted."""
+def timed(root: Path, stage: str, arm: str | None = None, runs: int = 1) -> Iterator[None]:
+    """Add the seconds that the block takes to `stage`; work of a killed process is not counted.
+
+    Args:
+        arm: setting/variant whose runs they were spent on, if on one.
+        runs: how many of its runs.
+    """
     start = time.monotonic()
     yield
-    line = json.dumps({"stage": stage, "seconds": round(time.monotonic() - start, 1)})
+    spent = {"stage": stage, "seconds": round(time.monotonic() - start, 1)}
+    line = json.dumps(spent | ({"arm": arm, "runs": runs} if arm else {}))
     with (root / TIMINGS).open("a") as file:  # one short write: processes that append at once do not mix
         file.write(line + "\n")
 
@@ -22,11 +33,22 @@ def timed(root: Path, stage: str) -> Iterator[None]:
 def seconds_by_stage(root: Path) -> dict[str, float]:
     """Sum the lines of a study's folder; processes that ran at once add up to more than passed on the clock."""
     total: dict[str, float] = {}
-    file = root / TIMINGS
-    for line in file.read_text().splitlines() if file.exists() else []:
-        try:
-            entry = json.loads(line)
-        except ValueError:  # a line that a full disk or a power cut tore
-            continue
+    for entry in _entries(root):
         total[entry["stage"]] = total.get(entry["stage"], 0) + entry["seconds"]
     return total
+
+
+def seconds_per_run(root: Path) -> dict[str, dict[str, float]]:
+    """What a run of each arm took by stage, the last time that the arm was at it."""
+    took: dict[str, dict[str, float]] = {}
+    for entry in _entries(root):
+        if "arm" in entry:
+            took.setdefault(entry["arm"], {})[entry["stage"]] = entry["seconds"] / entry["runs"]
+    return took
+
+
+def _entries(root: Path) -> Iterator[dict[str, Any]]:
+    file = root / TIMINGS
+    for line in file.read_text().splitlines() if file.exists() else []:
+        with suppress(ValueError):  # a line that a full disk or a power cut tore
+            yield json.loads(line)

@@ -1,4 +1,4 @@
-"""Held-out errors on other demonstrations of a setting than those that a policy was trained on."""
+"""Held-out errors of a study's policies, on all demonstrations of their setting."""
 
 import json
 import logging
@@ -9,7 +9,9 @@ from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.rollout.heldout import heldout_mse
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
+from lerobot_constructskill.training.checkpoints import read_facts
 from lerobot_constructskill.training.trainers import trainer_of
 
 FILE = "heldout.json"
@@ -27,7 +29,7 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, workers: 
     pairs = list_pairs(runs, others)
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         own = [run for run in runs if run.arm is arm and store.has(run.checkpoint)]
-        missing = [run for run in own if not store.has(run.heldout(data))]
+        missing = [run for run in own if not _is_known(run, data, store)]
         try:
             if missing:
                 _measure(arm, missing, data, store, workers)
@@ -37,23 +39,33 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, workers: 
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, Demonstrations]]:
-    """What is validated, and on which other set of its setting: none that would be made for `others` alone."""
+    """What is validated, and on which set of its setting: none that would be made for `others` alone.
+
+    A trainer with a measure of its own has told the error on what the policy was trained beside.
+    """
     arms = {id(run.arm): run.arm for run in runs}.values()
     own = [arm.demonstrations for arm in arms]
     spared = [run.arm.demonstrations for run in others if run.arm.demonstrations not in own]
     return [
         (arm, data)
         for arm in arms
-        if arm.policy and trainer_of(arm.policy).heldout_mse
+        if arm.policy
         for data in arm.validated_on
-        if data != arm.trained_on and data not in spared
+        if data not in spared and not (data == arm.trained_on and trainer_of(arm.policy).heldout_mse)
     ]
 
 
 def read_error(run: Run, data: Demonstrations, store: Store) -> float | None:
-    """What was measured, in m2."""
+    """What was measured, in m2, when the policy was trained or since."""
+    told = read_facts(store.folder(run.checkpoint)).get("heldout_mse_m2") if data == run.arm.trained_on else None
+    if told is not None:
+        return told
     made = run.heldout(data)
     return json.loads((store.folder(made) / FILE).read_text())["mse_m2"] if store.has(made) else None
+
+
+def _is_known(run: Run, data: Demonstrations, store: Store) -> bool:
+    return store.has(run.heldout(data)) or read_error(run, data, store) is not None
 
 
 def _measure(arm: Arm, runs: Sequence[Run], data: Demonstrations, store: Store, workers: int) -> None:
@@ -62,7 +74,10 @@ def _measure(arm: Arm, runs: Sequence[Run], data: Demonstrations, store: Store, 
     with store.claim([run.heldout(data) for run in runs]) as missing:
         runs = [run for run in runs if run.heldout(data) in missing]
         checkpoints = [store.folder(run.checkpoint) for run in runs]
-        errors = trainer_of(arm.policy).heldout_mse(arm.policy, checkpoints, dataset, episodes, store)
+        if own := trainer_of(arm.policy).heldout_mse:
+            errors = own(arm.policy, checkpoints, dataset, episodes, store)
+        else:
+            errors = (heldout_mse(checkpoint, arm.policy.device, dataset, episodes) for checkpoint in checkpoints)
         for run, error in zip(runs, errors, strict=True):
             with store.writing(run.heldout(data)) as folder:
                 folder.mkdir()

@@ -8,16 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils import OBS_STATE, auto_select_torch_device
+from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.parsing import decode
+from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import packages_of, policy_spec, trainer_of
+from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
 
 LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
 """Packages whose versions may show in any checkpoint."""
@@ -26,13 +26,8 @@ FACTS = "training.json"
 """In a checkpoint's folder: what its trainer says of it."""
 
 
-def decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    """The configuration of these fields, `type` among them."""
-    return decode(PreTrainedConfig, {"device": str(auto_select_torch_device()), **fields})
-
-
 def settle_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    """The same with everything written out that it leaves to the machine."""
+    """The configuration of these fields, with everything written out that it leaves to the machine."""
     config = decode_policy(fields)
     return trainer_of(config).settle(config)
 
@@ -65,7 +60,7 @@ def checkpoint_artifact(
 ) -> Artifact:
     """What a training seed of a settled policy makes of demonstrations with this specification."""
     facts = {"policy": policy_spec(policy), "training": asdict(training), "seed": seed}
-    made_by = versions(*LEARNING, *packages_of(policy))
+    made_by = versions(*LEARNING) | versions_of(policy)
     return Artifact("checkpoints", facts | {"demonstrations": demonstrations, "versions": made_by})
 
 

@@ -177,6 +177,10 @@ def test_the_rows_say_what_happened(undisturbed):
     assert {json.loads(one)["processor"] for one in finished["versions"]} == {processor()}
     for row in tiny.itertuples():
         assert json.loads(row.heldout_mse_m2_by_data) == {"smoke": row.heldout_mse_m2}
+    others = finished[finished["variant"].isin(["act", "theirs"])]
+    assert others["heldout_mse_m2"].between(0, 0.1, inclusive="neither").all(), "measured by their checkpoints"
+    told = {row.variant: "lerobot_policy_late" in row.versions for row in finished.itertuples()}
+    assert {name for name, is_theirs in told.items() if is_theirs} == {"theirs", "late_expert"}
     failed = undisturbed[undisturbed["error_kind"].notna()]
     assert list(failed["variant"]) == ["absent"] * 2 and failed["lifted"].isna().all()
     assert set(failed["error_kind"]) == {"weights"} and failed["error"].str.contains("/no/such/weights").all()

@@ -19,6 +19,7 @@ from lerobot_constructskill.errors import InputError, MachineError, UserError
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.scripts.study import study as study_command
 from lerobot_constructskill.study import execute
 from lerobot_constructskill.study import run as run_module
 from lerobot_constructskill.study.execute import EPISODES, Job, _let_through, _together
@@ -26,8 +27,9 @@ from lerobot_constructskill.study.rows import NOT_RUN, PROVENANCE, EpisodeRow, R
 from lerobot_constructskill.study.run import choose, run_study
 from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
-from lerobot_constructskill.study.table import Table, status
-from lerobot_constructskill.study.timing import TIMINGS, seconds_by_stage, timed
+from lerobot_constructskill.study.status import status
+from lerobot_constructskill.study.table import Table
+from lerobot_constructskill.study.timing import EVALUATION, TIMINGS, TRAINING, seconds_by_stage, timed
 from lerobot_constructskill.study.validate import list_pairs
 from lerobot_constructskill.training.checkpoints import FACTS
 from lerobot_constructskill.training.recipe import Training
@@ -68,6 +70,7 @@ def make_all(of: Study, root: Path) -> Table:
                 with store.writing(artifact) as folder:
                     folder.mkdir()
                     row = EpisodeRow(run=artifact.digest, training_seed=run.seed, evaluation_seed=1000, episode=0)
+                    row = replace(row, versions=json.dumps(run.versions))
                     write_rows([row], folder / EPISODES, EpisodeRow)
     return run_study(of, "", root / of.name, store, Options())
 
@@ -461,7 +464,89 @@ def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
     table.write()
     rows = read_rows(tmp_path / "rows.parquet")
     assert set(rows["error_kind"]) == {NOT_RUN} and len(rows) == 7 and set(rows["episodes"]) == {2}
-    assert "fixed/a: 0 finished, 0 failed, 3 missing" in status(table).splitlines()
+    assert "fixed/a: 0 finished, 0 failed, 3 missing" in status(table, table.runs).splitlines()
+
+
+THEIRS = "lerobot_policy_theirs"
+
+
+@pytest.fixture
+def edit(monkeypatch):
+    """Make all of LeRobot's policies somebody's plugin, of the source that is named."""
+
+    def to(source: str) -> None:
+        monkeypatch.setattr("lerobot_constructskill.training.trainers.code_of", lambda *_: {THEIRS: source})
+
+    to("source a")
+    return to
+
+
+def test_an_edited_plugin_is_told_and_its_runs_are_made_again_in_the_same_folder(tmp_path, edit, monkeypatch):
+    table = make_all(study(), tmp_path)
+    edit("source b")
+    runs = list_runs(study())
+    again = Table(tmp_path / "x", runs, table.store)
+    said = status(again, runs).splitlines()
+    assert f"fixed/a: 0 finished, 0 failed, 3 missing (3 made before with another {THEIRS})" in said
+    assert {"fixed/no_op: 1 finished, 0 failed, 0 missing", "fixed/replay: 1 finished, 0 failed, 0 missing"} <= {*said}
+    made = []
+    monkeypatch.setattr(run_module, "make_runs", lambda job: made.extend(job.runs) or ())
+    monkeypatch.setattr(run_module, "validate", lambda *_: None)
+    run_study(study(), "", tmp_path / "x", table.store, Options())  # what would be lost is in the store
+    assert [run.id for run in made] == [run.id for run in again.missing()]
+    edit("source a")
+    assert not Table(tmp_path / "x", list_runs(study()), table.store).missing(), "as it was, nothing is made"
+
+
+def test_other_fields_of_a_study_are_told_as_another_specification(tmp_path):
+    table = make_all(study(), tmp_path)
+    runs = list_runs(study(eval_seed=7))
+    said = status(Table(tmp_path / "x", runs, table.store), runs)
+    assert "fixed/b: 0 finished, 0 failed, 2 missing (2 made before with another specification)" in said
+
+
+def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, edit):
+    run = list_runs(study())[-1]
+    store, digest = Store(tmp_path), run.artifact.digest
+    refused = pytest.raises(MachineError, match=rf"{THEIRS} was edited while {run.id} was made; the same command")
+    with refused, execute._writing_checkpoint(store, run) as folder:
+        folder.mkdir()
+        edit("source b")
+    with refused:
+        execute._write_failed(Job((run,), store, tmp_path), run, ValueError("of a half-written line"))
+    assert not store.has(run.checkpoint) and not store.has(run.artifact) and run.artifact.digest == digest
+
+
+def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
+    runs = list_runs(study())
+    table = Table(tmp_path, runs, Store(tmp_path / "store"))
+    with timed(tmp_path, EVALUATION, "fixed/a", 2):
+        pass  # what took long ago is not what it takes
+    for stage in (TRAINING, EVALUATION):
+        with (tmp_path / TIMINGS).open("a") as file:
+            file.write(json.dumps({"stage": stage, "seconds": 200, "arm": "fixed/a", "runs": 2}) + "\n")
+    lines = status(table, runs).splitlines()
+    told = dict(zip(lines, lines[1:], strict=False))
+    assert told["fixed/a: 0 finished, 0 failed, 3 missing"] == "    to make: seeds 0, 1, 2, about 10 min"
+    assert told["fixed/b: 0 finished, 0 failed, 2 missing"] == "    to make: seeds 0, 1, time unknown"
+    assert lines[-1] == "To make: 7 runs, about 10 min beside those of unknown time, after the demonstrations smoke"
+    assert status(table, choose(runs, "fixed/a/seed_1")).splitlines() == [
+        "fixed/a: 0 finished, 0 failed, 1 missing",
+        "    to make: seeds 1, about 3 min",
+        "To make: 1 run, about 3 min, after the demonstrations smoke",
+    ]
+    with table.store.writing(runs[2].checkpoint) as folder:
+        folder.mkdir()
+    assert "seeds 0, about 100 s" in status(table, choose(runs, "fixed/a/seed_0")).replace(
+        "about 2 min", "about 100 s"
+    )
+
+
+def test_the_status_of_a_misspelt_part_is_refused(tmp_path):
+    fields = {name: getattr(study(), name) for name in ("name", "settings", "variants", "references", "episodes")}
+    asked = StudyConfig(**fields, root=tmp_path, store=tmp_path / "store", status=True, only="fixed/aa")
+    with pytest.raises(InputError, match="--only=fixed/aa matches no run"):
+        study_command(asked)
 
 
 def test_runs_that_are_something_else_are_one_sentence(tmp_path):

@@ -12,32 +12,60 @@ from lerobot_constructskill.artifacts import disk
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.training.checkpoints import writing_checkpoint
-from lerobot_constructskill.training.trainers import _call
+from lerobot_constructskill.training.lerobot_train import LOG, _call
+
+
+def run(code: str, folder: Path) -> None:
+    _call([sys.executable, "-c", code], folder / LOG)
 
 
 @pytest.mark.parametrize("said", ["CUDA out of memory.", "worker (pid 7) is killed by signal: Killed."])
-def test_a_training_without_memory_is_the_machines_doing(said):
+def test_a_training_without_memory_is_the_machines_doing(said, tmp_path):
     with pytest.raises(MachineError, match="ran out of memory"):
-        _call([sys.executable, "-c", f"import sys; sys.exit({said!r})"])
+        run(f"import sys; sys.exit({said!r})", tmp_path)
     with pytest.raises(MachineError, match="could not go on: OSError: .* No space left"):
-        _call([sys.executable, "-c", "import sys; sys.exit('OSError: [Errno 28] No space left on device')"])
-    with pytest.raises(RuntimeError, match="said last: diverged"):
-        _call([sys.executable, "-c", "import sys; sys.exit('diverged')"])
+        run("import sys; sys.exit('OSError: [Errno 28] No space left on device')", tmp_path)
+    with pytest.raises(RuntimeError, match="ended with status 1: diverged"):
+        run("import sys; sys.exit('diverged')", tmp_path)
 
 
 @pytest.mark.parametrize("signal", ["SIGKILL", "SIGTERM"])
-def test_a_training_that_was_killed_is_the_machines_doing(signal):
-    ending = f"import os, signal; os.kill(os.getpid(), signal.{signal})"
+def test_a_training_that_was_killed_is_the_machines_doing(signal, tmp_path):
     with pytest.raises(MachineError, match=rf"was killed \({signal}\)"):
-        _call([sys.executable, "-c", ending])
+        run(f"import os, signal; os.kill(os.getpid(), signal.{signal})", tmp_path)
 
 
 @pytest.mark.parametrize(
-    "ending, said", [("print('lost'); exit(3)", "status 3 .* lost"), ("import os; os.abort()", "status -6")]
+    "ending, said", [("print('lost'); exit(3)", "status 3: lost"), ("import os; os.abort()", "status -6")]
 )
-def test_a_training_that_ends_itself_is_the_policys_doing(ending, said):
+def test_a_training_that_ends_itself_is_the_policys_doing(ending, said, tmp_path):
     with pytest.raises(RuntimeError, match=said):
-        _call([sys.executable, "-c", ending])
+        run(ending, tmp_path)
+
+
+FAILS_UNDER_A_BAR = """
+from tqdm import tqdm
+bar = tqdm(total=8, desc="Training")
+try:
+    [][0]
+except IndexError as error:
+    raise ValueError("of the policy\\nand more") from error
+finally:
+    print("printed", flush=True)
+"""
+
+
+def test_a_training_that_fails_says_its_exception_and_not_its_progress_bar(tmp_path):
+    with pytest.raises(
+        RuntimeError, match="(?m)^lerobot-train ended with status 1: ValueError: of the policy$"
+    ) as caught:
+        run(FAILS_UNDER_A_BAR, tmp_path)
+    (note,) = caught.value.__notes__
+    assert note == (tmp_path / LOG).read_text() and "Training:   0%|" in note.splitlines()[-1]
+
+
+def test_what_a_training_prints_is_on_the_disk_while_it_runs(tmp_path):
+    run(f"print('begun', flush=True); assert open({str(tmp_path / LOG)!r}).read() == 'begun\\n'", tmp_path)
 
 
 def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, monkeypatch):

@@ -1,0 +1,84 @@
+"""What code by others is: its version and a hash of its source, wherever Python finds it. Standard library only.
+
+A policy in development changes all day and its version does not. So its source stands beside the version in whatever
+is found by a digest.
+"""
+
+import hashlib
+import re
+import sys
+from functools import cache
+from importlib.metadata import packages_distributions
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from lerobot_constructskill.artifacts.digests import file_sha256, installed
+
+BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
+"""Top-level packages of which the version says enough, LeRobot's and our own among them."""
+
+IMPORTED = re.compile(r"^\s*(?:from|import)\s+([A-Za-z_]\w*)", re.MULTILINE)
+
+
+def code_of(*things: Any) -> dict[str, str]:
+    """What the code is that defines some classes or functions, by the name of its distribution.
+
+    LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
+    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every Python file of the top-level package, and of
+    packages that it imports and that are part of the same distribution, or of none.
+    """
+    packages = {thing.__module__.partition(".")[0] for thing in things} - BY_VERSION
+    return dict(_told(package) for package in sorted(packages) if _files(package))
+
+
+def _told(package: str) -> tuple[str, str]:
+    name = _distribution(package) or package
+    source = f"source {_source_sha256(package)[:12]}"
+    return name, f"{version}, {source}" if (version := installed(name)) else source
+
+
+def _source_sha256(package: str) -> str:
+    """Hash the names and bytes of the source of a package, and of those that belong to it, as it is now."""
+    total = hashlib.sha256()
+    for name in sorted(_with_helpers(package)):
+        for relative, path in sorted(_files(name).items()):
+            total.update(f"{name}/{relative}".encode())
+            total.update(bytes.fromhex(file_sha256(path)))
+    return total.hexdigest()
+
+
+def _with_helpers(package: str) -> set[str]:
+    """A top-level package and those that belong to it."""
+    found, unread = {package}, [package]
+    while unread:
+        for path in _files(unread.pop()).values():
+            imported = {*IMPORTED.findall(path.read_text(errors="replace"))} - BY_VERSION - found
+            helpers = {name for name in imported if _distribution(name) in (None, _distribution(package))}
+            found |= helpers
+            unread += [name for name in helpers if _files(name)]
+    return found
+
+
+def _distribution(package: str) -> str | None:
+    """The installed distribution of a top-level package.
+
+    The metadata of an editable installation may not list its packages; a plugin of LeRobot's is named as its package.
+    """
+    return next(iter(_distributions().get(package, ())), package if installed(package) else None)
+
+
+_distributions = cache(packages_distributions)
+
+
+def _files(package: str) -> dict[str, Path]:
+    """The source files of a top-level package or module, by relative path; none where there is no such thing."""
+    try:
+        spec = find_spec(package)
+    except (ImportError, ValueError):  # the latter of `__main__`
+        spec = None
+    folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    found = {path.relative_to(folder).as_posix(): path for folder in folders for path in folder.rglob("*.py")}
+    if spec and spec.origin and spec.origin.endswith(".py"):
+        found.setdefault(Path(spec.origin).name, Path(spec.origin))
+    return found

@@ -1,0 +1,101 @@
+"""What there is of a study and what its command would make, without making anything."""
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from itertools import groupby
+
+from lerobot_constructskill.artifacts.store import LOG
+from lerobot_constructskill.errors import plural
+from lerobot_constructskill.study.runs import Run
+from lerobot_constructskill.study.table import Table
+from lerobot_constructskill.study.timing import EVALUATION, ROUNDS, TRAINING, seconds_per_run
+
+
+def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> str:
+    """Tell of the chosen runs: a line for each variant and reference of each setting, and what would be made of it.
+
+    Args:
+        chosen: those that the command is asked for.
+        retry_failed: whether it makes failed runs again.
+    """
+    due = [run for run in chosen if (rows := table.episodes(run)) is None or (retry_failed and rows[0].error_kind)]
+    lines = []
+    for name, runs in groupby(chosen, key=_arm):
+        runs = list(runs)
+        lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
+        if own := [run for run in due if run in runs]:
+            lines.append(f"    to make: {_seeds(own)}, {_time(table, own)}")
+    return "\n".join([*lines, _total(table, due)])
+
+
+def _arm(run: Run) -> str:
+    return run.arm.id
+
+
+def _counts(table: Table, runs: Sequence[Run]) -> str:
+    made = [rows for run in runs if (rows := table.episodes(run))]
+    failed = sum(bool(rows[0].error_kind) for rows in made)
+    counts = f"{len(made) - failed} finished, {failed} failed, {len(runs) - len(made)} missing"
+    changes = Counter(filter(None, (_changed(table, run) for run in runs if not table.episodes(run))))
+    told = [f"{number} made before with another {what}" for what, number in changes.items()]
+    return f"{counts} ({'; '.join(told)})" if told else counts
+
+
+def _changed(table: Table, run: Run) -> str | None:
+    """What is not as it was when the folder's table got rows of this run; None if it has none."""
+    row = table.outdated(run)
+    if row is None:
+        return None
+    before = json.loads(row.versions) if row.versions else run.versions
+    return ", ".join(name for name, now in run.versions.items() if before.get(name) != now) or "specification"
+
+
+def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
+    """A line for each reason."""
+    failed = [(run, rows[0]) for run in runs if (rows := table.episodes(run)) and rows[0].error_kind]
+    lines = []
+    for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
+        own = [run for run, _ in alike]
+        log = table.store.folder(own[0].artifact) / LOG
+        lines.append(f"    {_seeds(own)} ({kind}): {error} (log: {log})")
+    return lines
+
+
+def _seeds(runs: Sequence[Run]) -> str:
+    return f"seeds {', '.join(str(run.seed) for run in runs)}"
+
+
+def _seconds(table: Table, runs: Sequence[Run]) -> float | None:
+    """How long runs of one arm take, by how long its last ones took in this folder; None if that is not known."""
+    took = seconds_per_run(table.root).get(_arm(runs[0]), {})
+    untrained = [run for run in runs if run.checkpoint and not table.store.has(run.checkpoint)]
+    training = ROUNDS if runs[0].arm.dagger else TRAINING
+    if EVALUATION not in took or (untrained and training not in took):
+        return None
+    return len(runs) * took[EVALUATION] + (len(untrained) * took[training] if untrained else 0)
+
+
+def _time(table: Table, runs: Sequence[Run]) -> str:
+    seconds = _seconds(table, runs)
+    return "time unknown" if seconds is None else _about(seconds)
+
+
+def _about(seconds: float) -> str:
+    for size, unit in ((3600, "h"), (60, "min")):
+        if seconds >= 1.5 * size:
+            return f"about {seconds / size:.0f} {unit}"
+    return f"about {seconds:.0f} s"
+
+
+def _total(table: Table, due: Sequence[Run]) -> str:
+    if not due:
+        return "Nothing to make."
+    times = [_seconds(table, list(runs)) for _, runs in groupby(due, key=_arm)]
+    known = [seconds for seconds in times if seconds is not None]
+    time = _about(sum(known)) if known else "time unknown"
+    beside = " beside those of unknown time" if known and len(known) < len(times) else ""
+    used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
+    absent = [name for name, data in used.items() if not table.store.has(data.artifact)]
+    first = f", after the demonstrations {', '.join(absent)}" if absent else ""
+    return f"To make: {plural(len(due), 'run')}, {time}{beside}{first}"
