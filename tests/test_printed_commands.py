@@ -47,7 +47,7 @@ NOT_RUN = {
     "lerobot-eval --policy.path=outputs/smolvla": "needs its weights: tests/test_any_policy.py has random ones",
     "python examples/vla_evaluation_harness": "serves until it is killed: tests/test_vla_evaluation_harness.py",
     "PYTHONPATH=examples/vla_evaluation_harness": "asks that server",
-    "constructskill-check-task --task=lintel_to_wall": "a task of the reader's: tests/test_other_packages.py",
+    "constructskill-check-task --task=lintel_to_wall": "a task that the reader is to write: tests/test_check_task.py",
 }
 """How a printed command starts to why it is not run."""
 
