@@ -15,6 +15,8 @@ import pytest
 from commands import BIN, call
 
 from lerobot_constructskill import contract, other_tasks
+from lerobot_constructskill.demos.obtain import artifact
+from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
 
@@ -106,6 +108,17 @@ def test_rows_of_other_packages_come_after_ours(install):
     assert [task.name for task in contract.select_tasks("lay,turn")["constructskill"]] == ["lay", "turn"]
     with pytest.raises(InputError, match="'dril'; the tasks are: brick_to_bin, .*, drill"):
         contract.get_task("dril")
+
+
+def test_demonstrations_of_an_edited_scene_are_others(install, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    install(one=row("lay"))
+    config = GenerateConfig("local/lay", task="lay")
+    found = []
+    for length in ("0.20", "0.21"):
+        (tmp_path / "lay.py").write_text(f"LENGTH = {length}\n")
+        found.append((frames_digest(config), artifact(config).digest))
+    assert all(before != after for before, after in zip(*found, strict=True))
 
 
 @pytest.mark.parametrize("second", [row("lay", "Other-v1"), row("other", "lay-v1"), row("brick_to_bin")])

@@ -11,7 +11,6 @@ from functools import cache
 from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from lerobot_constructskill.artifacts.digests import file_sha256, installed
 
@@ -21,14 +20,17 @@ BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill",
 IMPORTED = re.compile(r"^\s*(?:from|import)\s+([A-Za-z_]\w*)", re.MULTILINE)
 
 
-def code_of(*things: Any) -> dict[str, str]:
-    """What the code is that defines some classes or functions, by the name of its distribution.
+def code_of(*names: str) -> dict[str, str]:
+    """What the code of some modules is, by the name of its distribution.
 
     LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
     a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every Python file of the top-level package, and of
     packages that it imports and that are part of the same distribution, or of none.
+
+    Args:
+        names: modules, or classes as `module:class`.
     """
-    packages = {thing.__module__.partition(".")[0] for thing in things} - BY_VERSION
+    packages = {re.split(r"[.:]", name)[0] for name in names} - BY_VERSION
     return dict(_told(package) for package in sorted(packages) if _files(package))
 
 

@@ -53,7 +53,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         "noise_covariance": (config.noise.root @ config.noise.root).tolist(),
         "attempts": len(attempts),
         "discarded_seeds": [attempt.seed for attempt in attempts if not attempt.success],
-        "versions": frame_versions(),
+        "versions": frame_versions(config.task),
         "sha256": file_hashes(folder),
     }
     (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n")

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from typing import Annotated, Any
 
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
@@ -114,9 +115,12 @@ def frames_digest(config: GenerateConfig) -> str:
 def code_facts(config: GenerateConfig) -> dict[str, Any]:
     """What a data set depends on beside its settings: encoder, columns, versions, and the advice if it labels."""
     columns = demonstration_features(get_task(config.task), config.obs_type)
-    facts = {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": frame_versions()}
+    made_by = frame_versions(config.task)
+    facts = {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": made_by}
     return facts | ({"advice": REVISION} if config.labels == "advice" else {})
 
 
-def frame_versions() -> dict[str, str]:
-    return versions(*FRAME_PACKAGES)
+def frame_versions(task: str) -> dict[str, str]:
+    """Versions of what makes the frames of a task; of another package's task, the source of its scene and expert."""
+    row = get_task(task)
+    return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert)

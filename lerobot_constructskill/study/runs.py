@@ -162,7 +162,8 @@ class Run:
     def versions(self) -> dict[str, str]:
         """What the packages are that may show in its episodes."""
         policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
-        return versions(*ACTING) | (versions_of(policy) if policy else code_of(reference.agent))
+        own = versions_of(policy) if policy else code_of(reference.agent.__module__)
+        return versions(*ACTING) | code_of(get_task(self.arm.env["task"]).scene) | own
 
     def heldout(self, demonstrations: Demonstrations) -> Artifact:
         """Its translation error on what is held out of some demonstrations."""

@@ -112,7 +112,7 @@ def versions_of(config: PreTrainedConfig) -> dict[str, str]:
     Others' code, of the policy and of its trainer, is told by its source too.
     """
     trainer = trainer_of(config)
-    return versions(*trainer.packages) | code_of(type(config), type(trainer))
+    return versions(*trainer.packages) | code_of(type(config).__module__, type(trainer).__module__)
 
 
 def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def folder(tmp_path: Path, monkeypatch):
 
 
 def told() -> dict[str, str]:
-    return code_of(type("TheirPolicy", (), {"__module__": DEFINES}))
+    return code_of(DEFINES)
 
 
 def install(folder: Path) -> None:
@@ -67,4 +67,4 @@ def test_a_moved_folder_is_the_same_code_and_a_new_file_is_not(folder, tmp_path_
 
 
 def test_lerobots_code_and_ours_go_by_their_versions():
-    assert code_of(ACTConfig, Store, Path, type("InAScript", (), {"__module__": "__main__"})) == {}
+    assert code_of(ACTConfig.__module__, f"{Store.__module__}:Store", "pathlib", "__main__") == {}
