@@ -1,15 +1,20 @@
 """ConstructSkill for LeRobot. A room imports only from rooms below it (`tests/test_architecture.py` holds them to it).
 
 scripts     console commands, one file each
+board       submissions, their replay, the leaderboard
+comparison  two sides judged over training seeds
 analysis    rows in, page out: statistics and report
 study       runs, made where they are missing
-rollout     agents in lockstep, references, simulators
+dagger      rounds that a policy drives and the expert labels
+rollout     agents in lockstep, references, simulators, errors offline
 dataset     what one does with a data set that is there
 demos       experts, noise, recorder
+training    how any LeRobot policy is trained in a study
 features    a data set through an encoder, once
 envs        what LeRobot sees
 sim         the simulator
 policies    frozen_vit
 artifacts   folders that are found by what made them
+interface   the contract of a task in plain values: units, ranges, frames, cameras
 contract    tasks, units and names, each once
 """
