@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "demos"))
 
 from disturbances import DISTURBANCES, recover  # noqa: E402
 
-from lerobot_constructskill.contract import TASKS, get_task  # noqa: E402
+from lerobot_constructskill.contract import SHIPPED, get_task  # noqa: E402
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert  # noqa: E402
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv  # noqa: E402
 
@@ -20,7 +20,7 @@ FIRST_SEED = 3_000_000
 
 
 def main(episodes: int, tasks: list[str]) -> None:
-    for task in tasks or TASKS:
+    for task in tasks or SHIPPED:
         env, expert = ConstructSkillEnv(task, render_backend="none"), make_expert(get_task(task), ExpertConfig())
         for name, disturbance in DISTURBANCES.items():
             seeds = range(FIRST_SEED, FIRST_SEED + episodes)

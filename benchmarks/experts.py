@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from run import machine
 
-from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.contract import SHIPPED
 from lerobot_constructskill.scripts.check_task import CheckTaskConfig, measure_expert
 
 FILE = Path(__file__).with_suffix(".json")
@@ -19,7 +19,7 @@ FILE = Path(__file__).with_suffix(".json")
 def main(names: list[str]) -> None:
     torch.set_num_threads(1)  # the tensors of one environment are too small for more
     counts = json.loads(FILE.read_text()) if FILE.exists() else {}
-    for name in names or TASKS:
+    for name in names or SHIPPED:
         config = CheckTaskConfig(name)
         lengths, failures = measure_expert(config)
         longest = max(lengths, default=0)

@@ -85,12 +85,6 @@ def held_out(n_episodes: int, every: int = HELD_OUT_EVERY) -> list[int]:
     return list(range(every - 1, n_episodes, every))
 
 
-def held_out_last(n_episodes: int) -> list[int]:
-    """Indices of all demonstrations, the held-out ones at the end."""
-    last = held_out(n_episodes)
-    return [index for index in range(n_episodes) if index not in last] + last
-
-
 STAGES = ("none", "lifted", "in_bin", "placed")
 """How far an episode came, in order."""
 

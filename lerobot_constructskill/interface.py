@@ -33,10 +33,10 @@ BASE_FRAME = "robot base: x forward, y to the left, z up; parallel to the world'
 STATE_UNITS = dict(zip(STATE_NAMES, ("m",) * 3 + ("rad",) * 3 + ("m",) * 2, strict=True))
 
 
-def describe(task: Task, cameras: Iterable[str], has_state: bool = True) -> dict[str, Any]:
+def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) -> dict[str, Any]:
     """The contract of `task`, as it is written to JSON.
 
-    A perturbation that moves a camera is not told.
+    Cameras are the unperturbed ones, also where a perturbation moves them.
 
     Args:
         cameras: those that are shown, by their names in `contract.CAMERAS`.

@@ -230,7 +230,11 @@ def test_no_room_meets_environments_and_policies() -> None:
     assert not both
 
 
-@pytest.mark.parametrize("module", [module for module, path in SOURCES.items() if path.name == "__init__.py"])
+INERT = [module for module, path in SOURCES.items() if path.name == "__init__.py" and path.parent.name != "sim"]
+"""All but the simulator's, which names Vulkan's drivers before any of its modules can import SAPIEN."""
+
+
+@pytest.mark.parametrize("module", INERT)
 def test_init_is_inert(module: str) -> None:
     body = ast.parse(SOURCES[module].read_text()).body
     assert not [node for node in body if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))]

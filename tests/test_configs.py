@@ -19,7 +19,7 @@ from metadata import write_metadata
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill import presets, tags
 from lerobot_constructskill.board.protocol import SUITES
-from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out, held_out_last
+from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError
@@ -260,7 +260,8 @@ def written(tmp_path):
 @pytest.mark.parametrize("n", [2, 100])
 def test_training_holds_out_every_eighth_episode_and_no_other(name, n, written, train_config, tmp_path):
     config = train_config(written(name, n), f"--output_dir={tmp_path / 'out'}")
-    assert config.dataset.root == str(tmp_path / f"set_{n}") and config.dataset.episodes == held_out_last(n)
+    assert config.dataset.root == str(tmp_path / f"set_{n}")
+    assert config.dataset.episodes == [i for i in range(n) if i not in held_out(n)] + held_out(n)
     assert math.ceil(n * config.dataset.eval_split) == len(held_out(n))
     assert bool(config.eval_steps) == (n >= 8) and config.steps % config.save_freq == 0
 

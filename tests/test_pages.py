@@ -18,8 +18,18 @@ README_LINES = 150
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_of_a_page_lead_somewhere(page):
     links = re.findall(r"\]\(([^)]+)\)", page.read_text())
-    dead = [link for link in links if "://" not in link and not (page.parent / link.partition("#")[0]).exists()]
-    assert not dead
+    assert not [link for link in links if "://" not in link and not leads_somewhere(page, *link.partition("#")[::2])]
+
+
+def leads_somewhere(page: Path, path: str, heading: str) -> bool:
+    target = page.parent / path if path else page
+    return target.exists() and (not heading or heading in headings(target))
+
+
+def headings(page: Path) -> set[str]:
+    """The names by which a Markdown page's headings are linked."""
+    titles = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

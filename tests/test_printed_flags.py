@@ -27,6 +27,7 @@ THEIRS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConf
 STAND_INS = {
     "constructskill-generate NAME": "constructskill-generate fast",
     "mine.yaml": "",
+    "tinybc.yaml": "",
     "outputs/dart_1.yaml": "",
     " ...": "",
     "=...": "=local/any",

@@ -28,8 +28,7 @@ GRIPPER = DimSpec(
 )
 
 
-def rotation(names: Sequence[str]) -> DimSpec:
-    """The specification of rotations with these names, such as `dyaw`."""
-    return DimSpec(
-        "rotation", len(names), f"delta_{'_'.join(names)}_radians", REACH, description="asked for in a step"
-    )
+def rotation(names: Sequence[str], is_radians: bool = True) -> DimSpec:
+    """The specification of rotations with these names, such as `dyaw`, in radians or from -1 to 1."""
+    unit, reach = ("radians", REACH) if is_radians else ("normalised", (-1, 1))
+    return DimSpec("rotation", len(names), f"delta_{'_'.join(names)}_{unit}", reach, description="asked for in a step")

@@ -17,7 +17,7 @@ from vla_eval.model_servers.serve import run_server
 from vla_eval.specs import GRIPPER_01, IMAGE_RGB, LANGUAGE, POSITION_DELTA, RAW, STATE_EEF_POS_AA_GRIP, DimSpec
 
 from lerobot_constructskill.contract import ACTION_SCALE, ROTATION, STATE_NAMES, TRANSLATION
-from lerobot_constructskill.lerobot_internals import register_third_party_plugins
+from lerobot_constructskill.lerobot_internals import load_plugins
 
 
 class ModelServer(LeRobotModelServer):
@@ -42,7 +42,7 @@ class ModelServer(LeRobotModelServer):
         is_metres = max(-low[moves].min(), high[moves].max()) <= ACTION_SCALE
         return {
             "position": specs.POSITION if is_metres else POSITION_DELTA,
-            **({"rotation": specs.rotation(turns)} if turns else {}),
+            **({"rotation": specs.rotation(turns, is_metres)} if turns else {}),
             "gripper": specs.GRIPPER if low[-1] < 0 else GRIPPER_01,
         }
 
@@ -56,5 +56,5 @@ class ModelServer(LeRobotModelServer):
 
 
 if __name__ == "__main__":
-    register_third_party_plugins()
+    load_plugins()
     run_server(ModelServer)

@@ -4,6 +4,7 @@ A policy in development changes all day and its version does not. So its source 
 is found by a digest.
 """
 
+import ast
 import hashlib
 import re
 import sys
@@ -17,15 +18,14 @@ from lerobot_constructskill.artifacts.digests import file_sha256, installed
 BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
 """Top-level packages of which the version says enough, LeRobot's and our own among them."""
 
-IMPORTED = re.compile(r"^\s*(?:from|import)\s+([A-Za-z_]\w*)", re.MULTILINE)
-
 
 def code_of(*names: str) -> dict[str, str]:
     """What the code of some modules is, by the name of its distribution.
 
     LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
-    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every Python file of the top-level package, and of
-    packages that it imports and that are part of the same distribution, or of none.
+    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the top-level package but bytecode,
+    so meshes and settings too, and of packages that it imports and that are of the same distribution, or of none.
+    Other distributions that it imports are not told.
 
     Args:
         names: modules, or classes as `module:class`.
@@ -55,11 +55,22 @@ def _with_helpers(package: str) -> set[str]:
     found, unread = {package}, [package]
     while unread:
         for path in _files(unread.pop()).values():
-            imported = {*IMPORTED.findall(path.read_text(errors="replace"))} - BY_VERSION - found
+            imported = _imported(path) - BY_VERSION - found
             helpers = {name for name in imported if _distribution(name) in (None, _distribution(package))}
             found |= helpers
             unread += [name for name in helpers if _files(name)]
     return found
+
+
+def _imported(path: Path) -> set[str]:
+    """The top-level packages that a file of Python imports."""
+    try:
+        nodes = [*ast.walk(ast.parse(path.read_bytes()))] if path.suffix == ".py" else []
+    except (SyntaxError, ValueError):  # somebody is at work on it
+        return set()
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module]
+    return {name.partition(".")[0] for name in names}
 
 
 def _distribution(package: str) -> str | None:
@@ -74,13 +85,18 @@ _distributions = cache(packages_distributions)
 
 
 def _files(package: str) -> dict[str, Path]:
-    """The source files of a top-level package or module, by relative path; none where there is no such thing."""
+    """The files of a top-level package or module, by relative path; none where there is no such thing."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):  # the latter of `__main__`
         spec = None
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
-    found = {path.relative_to(folder).as_posix(): path for folder in folders for path in folder.rglob("*.py")}
+    found = {
+        path.relative_to(folder).as_posix(): path
+        for folder in folders
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
     if spec and spec.origin and spec.origin.endswith(".py"):
         found.setdefault(Path(spec.origin).name, Path(spec.origin))
     return found

@@ -53,7 +53,7 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
 
 
 def _open_up(folder: Path) -> None:
-    """Give all that lies in a folder the access that it has itself by the umask.
+    """Let whoever may read a folder read what is in it.
 
     `tempfile`, by which LeRobot joins videos, lets nobody but their owner read files.
     """

@@ -12,10 +12,8 @@ from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recordin
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
-from lerobot_constructskill.training.checkpoints import LEARNING, check_inputs
+from lerobot_constructskill.training.checkpoints import ACTING, check_inputs
 from lerobot_constructskill.training.trainers import versions_of
-
-ACTING = (*LEARNING, "mani_skill", "sapien")
 
 
 def evaluate(

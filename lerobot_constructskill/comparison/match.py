@@ -43,7 +43,7 @@ class Comparison:
         a, b: the sides.
         conditions: where both were evaluated.
         starts: seeds of the episodes that both have, in order.
-        n_starts: how many starts one of them has, or both.
+        n_starts: number of different starts that the sides have together.
         rates_a, rates_b: share of those episodes that placed, of each training seed; 0 for one that failed.
         judgement: the statistics.
     """
@@ -92,7 +92,7 @@ def _check_asked(a: Found, b: Found, asked: Asked) -> None:
         raise InputError(f"'{a.name}' is both sides; name another for one of them.")
     kinds = {a.kind, b.kind}
     if asked.seed is not None and EVALUATED not in kinds and kinds != {CHECKPOINT}:
-        raise InputError("These sides say themselves from which starts they were evaluated: leave out --seed.")
+        raise InputError("The starts of these sides are known: leave out --seed.")
 
 
 def _read(found: Found) -> Side:

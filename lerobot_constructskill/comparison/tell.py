@@ -18,7 +18,7 @@ VERDICTS = {
     Verdict.BETTER: "A is better than B.",
     Verdict.WORSE: "A is worse than B.",
     Verdict.ALIKE: f"A and B are alike: they differ by less than {ALIKE_WITHIN * 100:.0f} points.",
-    Verdict.INCONCLUSIVE: "So many seeds do not show which of them is better.",
+    Verdict.INCONCLUSIVE: "This number of seeds does not show which of them is better.",
 }
 
 
@@ -51,11 +51,11 @@ def _sides(comparison: Comparison) -> str:
     lines = [f"{letter}  {side.name}: {side.kind}" for letter, side in (("A", comparison.a), ("B", comparison.b))]
     n = f"{len(comparison.starts)}"
     if comparison.n_starts > len(comparison.starts):
-        n += f" of the {comparison.n_starts} that one side has"
+        n += f" of {comparison.n_starts} that A or B has"
     lines.append(f"in {comparison.conditions}; {tell_starts(comparison.starts)} ({n})")
     for letter, side in (("A", comparison.a), ("B", comparison.b)):
         if side.env is None:
-            lines.append(f"lerobot-eval does not write where it evaluated: of {letter} that is assumed")
+            lines.append(f"lerobot-eval does not write where it evaluated: {letter} is taken to be as the other side")
     return "\n".join(lines)
 
 
@@ -82,7 +82,7 @@ def _verdict(judgement: Judgement, alpha: float) -> str:
         f"{VERDICTS[judgement.verdict]}\n"
         f"A - B: {apart.value * 100:+.1f} points ({interval}); p = {_p(judgement.p_value)}, permutation of seeds.\n"
         f"Seeds that placed at least once: p = {_p(judgement.counts_p_value)}, Boschloo's exact test.\n"
-        "The interval holds for whatever seeds may do, and so is wider than what the tests tell apart."
+        "The interval makes no assumption about how seeds vary, so it is wider than the tests suggest."
     )
 
 
@@ -100,7 +100,7 @@ def _power(judgement: Judgement, alpha: float) -> str:
         )
     if judgement.smallest_p_value >= alpha:
         return (
-            f"{a} and {plural(b, 'seed')} can show no difference, however large: their p-value is at least "
+            f"{plural(a, 'seed')} against {b} can show no difference, however large: their p-value is at least "
             f"{judgement.smallest_p_value:.2f}. Train more seeds."
         )
     visible = [
@@ -108,7 +108,7 @@ def _power(judgement: Judgement, alpha: float) -> str:
         (judgement.visible_at_worst, "if each seed places always or never"),
     ]
     told = "; ".join(f"{_points(difference)}, {condition}" for difference, condition in visible)
-    return " ".join([f"Found in {TARGET:.0%} of comparisons with so many seeds: {told}.", *_needed(judgement)])
+    return " ".join([f"With this many seeds, {TARGET:.0%} of comparisons would find: {told}.", *_needed(judgement)])
 
 
 def _points(difference: float | None) -> str:
@@ -132,11 +132,11 @@ def _versions(a: Side, b: Side) -> str:
     lines = {
         "Both were made with": same,
         "They differ in": different,
-        "A alone tells": only_a,
-        "B alone tells": only_b,
+        "Only A says": only_a,
+        "Only B says": only_b,
     }
     told = [f"{what} {_listed(named)}." for what, named in lines.items() if named]
-    return "\n".join(told) or "Nothing tells with which versions they were made."
+    return "\n".join(told) or "Neither side says with which versions it was made."
 
 
 def _listed(versions: dict[str, str]) -> str:

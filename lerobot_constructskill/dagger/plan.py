@@ -16,10 +16,10 @@ from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse_named
-from lerobot_constructskill.training.checkpoints import LEARNING, check_inputs, checkpoint_artifact, settle_policy
+from lerobot_constructskill.training.checkpoints import ACTING, check_inputs, checkpoint_artifact, settle_policy
 from lerobot_constructskill.training.trainers import versions_of
 
-ACTING = (*LEARNING, "mani_skill", "sapien", "av")
+DRIVING = (*ACTING, "av")
 """Packages whose versions may show in a round's frames, beside the policy's own."""
 
 
@@ -127,4 +127,4 @@ class Plan:
 
     @cached_property
     def _versions(self) -> dict[str, str]:
-        return versions(*ACTING) | versions_of(self.policy)
+        return versions(*DRIVING) | versions_of(self.policy)

@@ -104,7 +104,7 @@ def make_checkpoint(plan: Plan, number: int, store: Store) -> None:
     config, training, trainer = deepcopy(plan.policy), plan.config.training, trainer_of(plan.policy)
     data = obtain_data(plan, number, store)
     kept_out = held_out(data.num_episodes, training.holdout)
-    writers = {plan.config.seed: partial(writing_checkpoint, store, plan.checkpoint(number))}
+    writers = {plan.config.seed: partial(writing_checkpoint, store, plan.checkpoint(number), plan.policy)}
     with trainer.joined(config, data, parts_of(plan, number, store), store):
         trainer.fit(config, data, writers, training.epochs, training.batch_size, kept_out, store)
 

@@ -11,9 +11,10 @@ from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.interface import describe
+from lerobot_constructskill.interface import describe_task
 
-Version = Annotated[str, Pattern(r"[\w.+!-]{1,64}", "a version")]
+Version = Annotated[str, Pattern(r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}|[\w.+!-]{1,64}", "a version")]
+"""Of a package, and of one whose source is told as well (`artifacts/code.py`)."""
 
 MEANINGS = {
     "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",
@@ -29,7 +30,7 @@ MEANINGS = {
     "sim.bin_position": "privileged: centre of the bin's interior, m, world frame",
     "sim.bin_interior": "privileged: the bin's inner edges, m",
     "sim.joint_positions": "privileged: the arm's seven joints (rad) and the two fingers (m)",
-    "sim.joint_velocities": "privileged: the same in a second (rad/s, m/s)",
+    "sim.joint_velocities": "privileged: velocities of the same joints (rad/s, m/s)",
     "sim.seed": "seed of the episode's initial state and noise",
     "dagger.round": "the round in which the frame came about, 0 for demonstrations",
     "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",
@@ -125,7 +126,7 @@ def render(facts: dict[str, Any]) -> str:
         fps=FPS,
         seed_start=DEMO_SEED_START,
         cameras=cameras,
-        contract=describe(task, [camera.name for camera in cameras]),
+        contract=describe_task(task, [camera.name for camera in cameras]),
         features={name: feature for name, feature in features.items() if name in MEANINGS},
         meanings=MEANINGS
         | (ADVISED if "dagger" in facts or facts["generator"]["labels"] == "advice" else {})

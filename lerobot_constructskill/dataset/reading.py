@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
 KEY_FRAMES = 8
-"""How many key frames of each camera are looked at; the time that it takes does not grow with the data set."""
+"""How many key frames of each camera are decoded."""
 
 BESIDE = range(-2, 2)
 """Frames to read beside each of them."""

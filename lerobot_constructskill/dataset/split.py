@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_constructskill.contract import held_out, held_out_last
+from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dataset.dataset import check_is_there
 from lerobot_constructskill.errors import InputError
 
@@ -64,10 +64,11 @@ def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
     if out and low >= high:
         told = ", ".join(f"{k} of {n}" for k, n in counts)
         raise InputError(
-            f"Of the tasks of this set every eighth demonstration is {told}, and LeRobot holds out one share of all: "
-            "train on a set of each task, or on one with equally many demonstrations of each."
+            f"LeRobot holds out the same share of each task, but every eighth demonstration of this set is {told} of "
+            "its tasks: train on a set of each task, or on one with equally many demonstrations of each."
         )
-    return Split(held_out_last(len(lengths)), len(out), (low + high) / 2 if out else 0.0, frames)
+    last = sorted(range(len(lengths)), key=out.__contains__)  # stable: both parts stay in order
+    return Split(last, len(out), (low + high) / 2 if out else 0.0, frames)
 
 
 def _counts(task: str, tasks: Sequence[str], out: set[int]) -> tuple[int, int]:

@@ -15,7 +15,7 @@ SIDECAR = "meta/constructskill.json"
 """Where a data set keeps how it was made, relative to its root."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
-"""What data sets of before have not: none of these columns, and no names of the numbers of `sim.*` and `next.*`."""
+"""Columns that data sets of earlier versions lack; such sets also have no channel names in `sim.*` and `next.*`."""
 
 
 def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.contract import CAMERAS, GRIPPER, OBS_TYPES, ROTATION, STATE_NAMES, TRANSLATION, Task
-from lerobot_constructskill.interface import describe
+from lerobot_constructskill.interface import describe_task
 
 MODALITY, CONTRACT = "meta/modality.json", "meta/contract.json"
 
@@ -19,7 +19,7 @@ ACTION_PARTS = {"end_effector_position": TRANSLATION, "end_effector_rotation": R
 
 def write_meanings(root: Path, task: Task, obs_type: str) -> None:
     """Write both files of a data set of `task` seen as `obs_type`."""
-    for name, content in ((MODALITY, modality(task, obs_type)), (CONTRACT, describe(task, OBS_TYPES[obs_type]))):
+    for name, content in ((MODALITY, modality(task, obs_type)), (CONTRACT, describe_task(task, OBS_TYPES[obs_type]))):
         (root / name).write_text(json.dumps(content, indent=2) + "\n")
 
 

@@ -15,9 +15,8 @@ def start_fork_server(preload: Sequence[str]) -> None:
     The server must not initialise CUDA: its workers would inherit that, and could use neither CUDA nor Vulkan. LeRobot
     imports diffusers, which asks torch for a GPU.
     """
-    from lerobot_constructskill.sim.drivers import show_all_drivers
+    import lerobot_constructskill.sim  # noqa: F401  names Vulkan's drivers, which the server hands on
 
-    show_all_drivers()
     forkserver.set_forkserver_preload(list(preload))
     with _set(NVML_CHECK, "1"):
         forkserver.ensure_running()

@@ -1,6 +1,7 @@
 """Sub-environments that stand still after their episode's end, until somebody resets the vector environment."""
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -35,9 +36,17 @@ class StaysDone:
     the first of a new episode.
     """
 
+    @cached_property
+    def _ended(self) -> np.ndarray:
+        """Whether each episode was terminated, and truncated: (2, num_envs)."""
+        return np.zeros((2, self.num_envs), dtype=bool)
+
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
-        self._ended = np.zeros((2, self.num_envs), dtype=bool)
-        return super().reset(**given)
+        """Begin an episode in every environment, or in those of Gymnasium's `options["reset_mask"]`, (num_envs,)."""
+        chosen = (given.get("options") or {}).get("reset_mask", slice(None))
+        result = super().reset(**given)
+        self._ended[:, chosen] = False
+        return result
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         obs, reward, terminated, truncated, info = super().step(actions)
@@ -64,7 +73,8 @@ class LazyAsyncVectorEnv(StaysDone, _LazyAsyncVectorEnv):
         super().__init__(env_fns, probe.observation_space, probe.action_space, metadata)
 
     def _ensure(self) -> None:
-        start_fork_server(PRELOADED)
+        if self._env is None:
+            start_fork_server(PRELOADED)
         super()._ensure()
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:

@@ -24,7 +24,7 @@ from lerobot_constructskill.contract import (
 from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
 from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
-from lerobot_constructskill.interface import describe
+from lerobot_constructskill.interface import describe_task
 from lerobot_constructskill.perturbations import Perturbation
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
@@ -166,8 +166,8 @@ class ConstructSkillEnv(gym.Env):
 
     @property
     def contract(self) -> dict[str, Any]:
-        """What actions and observations mean, as `interface.describe` says it: units, ranges, frames and cameras."""
-        return describe(self._row, self.cameras, has_state=self.obs_type == "pixels_agent_pos")
+        """What actions and observations mean, as `interface.describe_task` says: units, ranges, frames and cameras."""
+        return describe_task(self._row, self.cameras, has_state=self.obs_type == "pixels_agent_pos")
 
     # For experts and recorders
 
@@ -200,9 +200,6 @@ class ConstructSkillEnv(gym.Env):
             InputError: the task is another package's, whose scene cannot be imported.
             OSError: the simulator is not installed, or there is no device to render with.
         """
-        from lerobot_constructskill.sim.drivers import show_all_drivers
-
-        show_all_drivers()
         try:
             from lerobot_constructskill.sim.register import register
         except ModuleNotFoundError as error:  # Gymnasium's worker processes drop the name of the package
@@ -276,9 +273,6 @@ def _spare_imports() -> None:
 
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
     """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
-    from lerobot_constructskill.sim.drivers import show_all_drivers
-
-    show_all_drivers()
     try:
         from lerobot_constructskill.sim.rendering import best_render_backend
     except ModuleNotFoundError:

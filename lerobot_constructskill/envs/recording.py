@@ -98,7 +98,8 @@ class Recording(Outcome):
     def of(cls, outcome: Outcome, actions: list[np.ndarray], **facts: Any) -> "Recording":
         """The recording of an episode that has ended; `facts` are the other fields of `Recording`."""
         went = {one.name: getattr(outcome, one.name) for one in fields(Outcome)}
-        return cls(**went, actions=actions, **facts)
+        clipped = getattr(outcome, "clipped_steps", None)  # a submission's claim has no such field
+        return cls(**went, clipped_steps=clipped, actions=actions, **facts)
 
     @property
     def flat(self) -> np.ndarray:

@@ -130,10 +130,10 @@ class PolicyAgent:
         try:
             return self.policy.select_action(batch)
         except KeyError as error:
-            if not str(error.args[0]).startswith("observation."):
+            if not (name := str(error).strip("'")).startswith("observation."):
                 raise
             raise InputError(
-                f"The policy reads {error.args[0]}, which it was not shown: obs_type=pixels_agent_pos has the wrist "
+                f"The policy reads {name}, which it was not shown: obs_type=pixels_agent_pos has the wrist "
                 "camera and the state; pixels has the base camera alone."
             ) from error
 

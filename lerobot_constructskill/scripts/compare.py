@@ -1,6 +1,7 @@
 """`constructskill-compare`: is policy A better than policy B? Over training seeds, evaluated on the same starts."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from lerobot_constructskill.analysis.section import Level
 from lerobot_constructskill.bounds import Among, Count, Device, Seed, Steps, Text, check
 from lerobot_constructskill.contract import OBS_TYPES
-from lerobot_constructskill.errors import TakenError
 from lerobot_constructskill.scripts.console import run
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ class CompareConfig:
     Args:
         a: the first side, the candidate.
         b: the second side, what it is compared with.
-        task: where neither side says it.
+        task: the task, if neither side names one.
         obs_type: as of lerobot-eval's --env, where neither side says it; pixels by default.
         episode_length: the same; the task's own by default.
         perturb: the same; none by default.
         perturb_seed: the same; 0 by default.
-        seed: what lerobot-eval was given; for two sides of checkpoints the first start, 1000 by default.
+        seed: the --seed that lerobot-eval was given; for two sides of checkpoints, the first start (default 1000).
         episodes: at most so many starts; for two sides of checkpoints 50 by default.
         fail_if: "worse" ends with status 3 where A is worse than B; else the status is 0 whatever the verdict.
         alpha: level of the tests.
@@ -80,37 +80,30 @@ def compare(config: CompareConfig) -> str:
         TakenError: the output folder exists.
         SystemExit: A is worse, and `fail_if` says that this fails.
     """
-    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.artifacts.folders import staged
     from lerobot_constructskill.comparison import match
     from lerobot_constructskill.comparison.find import find
     from lerobot_constructskill.comparison.tell import as_json, tell
 
-    if config.out is not None and config.out.exists():
-        raise TakenError(f"The output folder {config.out} exists already; remove it or name another.")
     a, b = find(config.a), find(config.b)
+    with staged(config.out) if config.out else nullcontext() as folder:
 
-    def evaluated(found: "Found", env: Mapping[str, Any], starts: Sequence[int]) -> "Side":
-        return _evaluate(config, found, env, starts, "a" if found is a else "b")
+        def evaluated(found: "Found", env: Mapping[str, Any], starts: Sequence[int]) -> "Side":
+            from lerobot_constructskill.comparison.evaluate import evaluate
 
-    asked = match.Asked(config.env, config.seed, config.episodes)
-    comparison = match.compare(a, b, asked, evaluated, config.alpha)
+            kept_in = folder and folder / ("a" if found is a else "b")
+            return evaluate(found.name, found.folders, env, starts, config.together, config.device, kept_in)
+
+        asked = match.Asked(config.env, config.seed, config.episodes)
+        comparison = match.compare(a, b, asked, evaluated, config.alpha)
+        if folder:
+            folder.mkdir(exist_ok=True)
+            (folder / "comparison.json").write_text(as_json(comparison))
     told = tell(comparison, config.alpha)
-    if config.out is not None:
-        with replaced(config.out / "comparison.json") as partial:
-            partial.write_text(as_json(comparison))
     if config.fail_if == comparison.judgement.verdict:
         print(told)
         raise SystemExit(FAILED)
     return told
-
-
-def _evaluate(
-    config: CompareConfig, found: "Found", env: Mapping[str, Any], starts: Sequence[int], side: str
-) -> "Side":
-    from lerobot_constructskill.comparison.evaluate import evaluate
-
-    kept_in = config.out and config.out / side
-    return evaluate(found.name, found.folders, env, starts, config.together, config.device, kept_in)
 
 
 def main() -> None:

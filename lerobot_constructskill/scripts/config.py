@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot_constructskill.bounds import Count, RepoId, check
-from lerobot_constructskill.errors import InputError, MissingError, plural
+from lerobot_constructskill.errors import InputError, MissingError, TakenError, plural
 from lerobot_constructskill.presets import KINDS, description, find, named, names
 from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
 
@@ -76,6 +76,7 @@ def write(training: TrainingFile) -> Path:
     Raises:
         MissingError: there is no such data set.
         InputError: LeRobot cannot hold out every eighth demonstration of this set.
+        TakenError: the file is there and is not one that was written like this.
         OSError: the Hub does not have the data set, or the file cannot be written.
     """
     from lerobot_constructskill import tags
@@ -89,6 +90,10 @@ def write(training: TrainingFile) -> Path:
     split = split_of(training.root or _find_set(training.repo_id))
     passes = training.passes or template["passes"]
     text = f"{_comment(training, split, passes)}\n{_dump(fill(template, source, split, passes))}"
+    if training.file.exists() and not training.file.read_text(errors="replace").startswith(f"# {TRAIN}"):
+        raise TakenError(
+            f"{training.file} exists and was not written by constructskill-config: name another with --out."
+        )
     with replaced(training.file) as partial:
         partial.write_text(text)
     return training.file

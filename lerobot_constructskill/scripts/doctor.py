@@ -35,8 +35,7 @@ PROBE_TIMEOUT_S = 600  # importing LeRobot took 3 minutes on one core of a busy 
 
 # The choice of `best_render_backend`, without ManiSkill.
 RENDER = """
-from lerobot_constructskill.sim.drivers import show_all_drivers
-show_all_drivers()
+import lerobot_constructskill.sim  # names Vulkan's drivers before SAPIEN does
 import sapien
 try:
     device = sapien.Device("cuda")

@@ -1,4 +1,4 @@
-"""Actions that ask for more than the controller gives: clipped, counted, and once a process told."""
+"""Actions that ask for more than the controller gives are clipped and counted; once a process that is logged."""
 
 import logging
 from typing import ClassVar
@@ -8,7 +8,7 @@ import torch
 from lerobot_constructskill.contract import ACTION_SCALE
 
 LEAST, SHARE = 10, 0.1
-"""So many clipped actions of an episode, and more than this share of those so far, are told."""
+"""So many clipped actions of an episode, and more than this share of those so far, are logged."""
 
 logger = logging.getLogger(__name__)
 
@@ -46,8 +46,8 @@ class Clipping:
             return
         Clipping.has_told = True
         logger.warning(
-            "%d of the first %d actions of an episode asked for more than %g m or rad and were clipped: LeRobot's "
-            "environment takes metres and radians per step, not -1 to 1 (its attribute `contract` says units and "
-            "ranges); ManiSkill's ids take -1 to 1, where 1 stands for %g m or rad.",
+            "%d of the first %d actions of an episode asked for more than %g m or rad and were clipped. "
+            "--env.type=constructskill takes metres and radians per step, not -1 to 1 (`env.contract` says units and "
+            "ranges); ManiSkill's ids take -1 to 1, where 1 is %g m or rad.",
             *(clipped, steps, ACTION_SCALE, ACTION_SCALE),
         )

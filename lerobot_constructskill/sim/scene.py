@@ -170,6 +170,8 @@ class PickPlaceEnv(BaseEnv):
                 **kwargs,
             )
         except AssertionError as error:  # ManiSkill's sentence about one of its arguments
+            if not str(error):
+                raise
             raise InputError(str(error)) from error
         except RuntimeError as error:
             if (lack := machine_lacks(error)) is None:

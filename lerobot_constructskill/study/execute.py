@@ -6,14 +6,12 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import httpx
 import torch
@@ -35,8 +33,8 @@ from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
-from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
-from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of, versions_of
+from lerobot_constructskill.training.checkpoints import check_unedited, read_facts, writing_checkpoint
+from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
@@ -133,29 +131,11 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
                 make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(_writing_checkpoint, job.store, run) for run in runs}
+    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint, arm.policy) for run in runs}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
     with timed(job.times, TRAINING, arm.id, len(runs)):
         trainer_of(config).fit(config, dataset, writers, training.epochs, training.batch_size, kept_out, job.store)
-
-
-@contextmanager
-def _writing_checkpoint(store: Store, run: Run, **facts: Any) -> Iterator[Path]:
-    with writing_checkpoint(store, run.checkpoint, **facts) as folder:
-        yield folder
-        _check_unedited(run)
-
-
-def _check_unedited(run: Run) -> None:
-    """Let nothing be written under the name of what a policy was before somebody edited it.
-
-    Raises:
-        MachineError: its code is not what it was when the study began.
-    """
-    now = versions_of(run.arm.policy) if run.arm.policy else {}
-    if edited := [name for name, code in now.items() if run.versions.get(name) != code]:
-        raise MachineError(f"{edited[0]} was edited while {run.id} was made; the same command makes it as it is now.")
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
@@ -198,11 +178,8 @@ def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
     start = {name: run.arm.env[name] for name in STARTING}
     told = {"backend": rollout.backend, **start}
-    recordings = [
-        Recording.of(episode, actions, clipped_steps=episode.clipped_steps, **told)
-        for episode, actions in zip(rollout.episodes, rollout.actions, strict=True)
-    ]
-    return _write(job, run, rows, write_video, recordings)
+    pairs = zip(rollout.episodes, rollout.actions, strict=True)
+    return _write(job, run, rows, write_video, [Recording.of(episode, actions, **told) for episode, actions in pairs])
 
 
 def _write_failed(job: Job, run: Run, error: Exception) -> Run:
@@ -218,7 +195,7 @@ def _write(
     write_video: Callable[[Path], None] = lambda path: None,
     recordings: Sequence[Recording] = (),
 ) -> Run:
-    _check_unedited(run)
+    check_unedited(run.versions, Run(run.arm, run.seed).versions)
     with job.store.writing(run.artifact) as folder:
         folder.mkdir()
         write_rows(rows, folder / EPISODES, EpisodeRow)

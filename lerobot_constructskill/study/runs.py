@@ -25,7 +25,7 @@ from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.spec import SHARED, Study, Variant
 from lerobot_constructskill.training.checkpoints import (
-    LEARNING,
+    ACTING,
     check_inputs,
     checkpoint_artifact,
     settle_policy,
@@ -33,10 +33,6 @@ from lerobot_constructskill.training.checkpoints import (
 )
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import versions_of
-
-ACTING = (*LEARNING, "mani_skill", "sapien")
-"""Packages whose versions may show in what any agent does."""
-
 
 SEEDS_APART = 2_000
 """From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
@@ -162,8 +158,9 @@ class Run:
     def versions(self) -> dict[str, str]:
         """What the packages are that may show in its episodes."""
         policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
+        task = get_task(self.arm.env["task"])
         own = versions_of(policy) if policy else code_of(reference.agent.__module__)
-        return versions(*ACTING) | code_of(get_task(self.arm.env["task"]).scene) | own
+        return versions(*ACTING) | code_of(task.scene, task.expert) | own
 
     def heldout(self, demonstrations: Demonstrations) -> Artifact:
         """Its translation error on what is held out of some demonstrations."""

@@ -63,7 +63,7 @@ def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
 
 
 def _seeds(runs: Sequence[Run]) -> str:
-    return f"seeds {', '.join(str(run.seed) for run in runs)}"
+    return f"{'seed' if len(runs) == 1 else 'seeds'} {', '.join(str(run.seed) for run in runs)}"
 
 
 def _seconds(table: Table, runs: Sequence[Run]) -> float | None:
@@ -94,8 +94,8 @@ def _total(table: Table, due: Sequence[Run]) -> str:
     times = [_seconds(table, list(runs)) for _, runs in groupby(due, key=_arm)]
     known = [seconds for seconds in times if seconds is not None]
     time = _about(sum(known)) if known else "time unknown"
-    beside = " beside those of unknown time" if known and len(known) < len(times) else ""
+    beside = " and some of unknown time" if known and len(known) < len(times) else ""
     used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
     absent = [name for name, data in used.items() if not table.store.has(data.artifact)]
-    first = f", after the demonstrations {', '.join(absent)}" if absent else ""
+    first = f"; first the demonstrations: {', '.join(absent)}" if absent else ""
     return f"To make: {plural(len(due), 'run')}, {time}{beside}{first}"

@@ -14,13 +14,16 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import OBS_TYPES
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
 
 LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
 """Packages whose versions may show in any checkpoint."""
+
+ACTING = (*LEARNING, "mani_skill", "sapien")
+"""Packages whose versions may show in what any agent does."""
 
 FACTS = "training.json"
 """In a checkpoint's folder: what its trainer says of it."""
@@ -65,11 +68,32 @@ def checkpoint_artifact(
 
 
 @contextmanager
-def writing_checkpoint(store: Store, checkpoint: Artifact, **facts: Any) -> Iterator[Path]:
-    """A `trainers.Writer`, but for its first two arguments."""
+def writing_checkpoint(store: Store, checkpoint: Artifact, policy: PreTrainedConfig, **facts: Any) -> Iterator[Path]:
+    """A `trainers.Writer`, but for its first three arguments.
+
+    Raises:
+        MachineError: the policy's code is not what it was when the checkpoint was asked for.
+    """
     with store.writing(checkpoint) as folder, room_for(folder):
         yield folder
+        check_unedited(checkpoint.spec["versions"], versions_of(policy))
         (folder / FACTS).write_text(json.dumps(facts) + "\n")
+
+
+def check_unedited(before: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Let nothing be written under the name of what some code was before somebody edited it.
+
+    Args:
+        before, now: package to version and source.
+
+    Raises:
+        MachineError: they differ.
+    """
+    if changed := [name for name, code in now.items() if before.get(name) != code]:
+        raise MachineError(
+            f"{changed[0]} is not what it was when this began: it was edited, or this machine has another copy. "
+            "The same command makes what is missing with what it is now."
+        )
 
 
 def read_facts(checkpoint: Path) -> dict:

@@ -102,7 +102,6 @@ def _judge(status: int, said: str) -> Exception:
     """What to raise of a command that failed."""
     if -status in KILLED:
         name = signal.Signals(-status).name
-        name = signal.Signals(-status).name
         return MachineError(
             f"lerobot-train was killed ({name}), for want of memory perhaps; the same command goes on."
         )

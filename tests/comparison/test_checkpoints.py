@@ -53,7 +53,7 @@ def test_checkpoints_are_evaluated_in_a_studys_conditions_and_their_recordings_a
     published, out = study([3, 0, 3, 1], starts=range(2000, 2003)), tmp_path / "out"
     told = compare(CompareConfig(sides, published, episodes=2, out=out))
     assert "2 checkpoints, evaluated now" in told and "0 of 2" in told
-    assert "starts 2000 to 2001 (2 of the 3 that either side has)" in told
+    assert "starts 2000 to 2001 (2 of 3 that A or B has)" in told
     (first, second) = sorted((out / "a").iterdir())
     assert [first.name, second.name] == ["00_seed_0", "01_seed_1"]
     episodes, others = (read_recordings(folder / "recordings.parquet") for folder in (first, second))

@@ -164,11 +164,11 @@ def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, 
     assert "Both were made with lerobot 0.6.1; processor a CPU." in told
     one = compare(CompareConfig(recorded(GOOD[:1]), study(BAD[:1])))
     assert "One training seed a side tells how these two checkpoints do, and nothing of their policies" in one
-    assert "So many seeds do not show which of them is better." in one
-    assert "They differ in torch (" in one and "B alone tells lerobot 0.6.1; processor a CPU." in one
+    assert "This number of seeds does not show which of them is better." in one
+    assert "They differ in torch (" in one and "Only B says lerobot 0.6.1; processor a CPU." in one
     few = compare(CompareConfig(evaluated(GOOD[:3]), study(BAD[:3], "few"), seed=1000))
-    assert "3 and 3 seeds can show no difference, however large: their p-value is at least 0.10." in few
-    assert "does not write where it evaluated: of A that is assumed" in few and "B alone tells lerobot 0.6.1" in few
+    assert "3 seeds against 3 can show no difference, however large: their p-value is at least 0.10." in few
+    assert "does not write where it evaluated: A is taken to be as the other side" in few and "Only B says lerobot 0.6.1" in few
 
 
 def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys, monkeypatch, tmp_path):
@@ -191,7 +191,7 @@ def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys
             found = ended.code
         out, said = capsys.readouterr()
         assert ("put a pattern in quotation marks" in said) == ("third" in flags)
-        assert found == status and ("than B." in out or "do not show which" in out) == (status != 1), (flags, out)
+        assert found == status and ("than B." in out or "does not show which" in out) == (status != 1), (flags, out)
 
 
 def test_every_number_is_in_a_file(study, tmp_path):

@@ -22,7 +22,7 @@ from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.modality import CONTRACT, modality
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.interface import describe
+from lerobot_constructskill.interface import describe_task
 from lerobot_constructskill.scripts.generate import generate
 
 CARDS = Path(__file__).parents[2] / "datasets_cards"
@@ -93,7 +93,7 @@ def test_the_training_commands_are_ones_that_lerobot_takes(card):
 
 def test_the_contract_stands_beside_the_data_and_on_the_card(card, data):
     said = json.loads((data.root / CONTRACT).read_text())
-    assert said == describe(TASKS["brick_to_bin"], ["base"]) and said["fps"] == data.info["fps"]
+    assert said == describe_task(TASKS["brick_to_bin"], ["base"]) and said["fps"] == data.info["fps"]
     features = data.info["features"]
     for part in (said["action"], said["state"]):
         assert [channel["name"] for channel in part["channels"]] == features[part["key"]]["names"]

@@ -49,7 +49,7 @@ def test_of_several_tasks_it_holds_out_the_same(counts, monkeypatch):
 
 
 def test_tasks_that_no_share_splits_as_the_contract_does_are_refused():
-    with pytest.raises(InputError, match="is 10 of 80, 0 of 7, and LeRobot holds out one share"):
+    with pytest.raises(InputError, match="of this set is 10 of 80, 0 of 7 of its tasks"):
         split([100] * 87, ["a"] * 80 + ["b"] * 7)
 
 

@@ -9,7 +9,7 @@ import pytest
 import lerobot_constructskill.sim.register  # noqa: F401
 from lerobot_constructskill.contract import CAMERAS, FINGER_TARGETS, OBS_TYPES, TASKS, TCP_IN_HAND
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.interface import describe
+from lerobot_constructskill.interface import describe_task
 
 pytestmark = pytest.mark.sim
 
@@ -28,7 +28,7 @@ def scene():
 
 @pytest.mark.parametrize("name", CAMERAS)
 def test_a_camera_stands_and_sees_as_the_contract_says(scene, name):
-    said = json.loads(json.dumps(describe(TASKS[TASK], CAMERAS)))["cameras"][name]
+    said = json.loads(json.dumps(describe_task(TASKS[TASK], CAMERAS)))["cameras"][name]
     true = scene.get_sensor_params()[name]
     np.testing.assert_allclose(said["intrinsics"], true["intrinsic_cv"][0], atol=1e-3)
     frame = np.eye(4)
@@ -42,7 +42,7 @@ def test_a_camera_stands_and_sees_as_the_contract_says(scene, name):
 
 
 def test_the_robot_and_its_gripper_are_where_the_contract_says(scene):
-    said = describe(TASKS[TASK], ())
+    said = describe_task(TASKS[TASK], ())
     base, hand, tcp = (
         scene.agent.robot.links_map[name].pose for name in ("panda_link0", "panda_hand", "panda_hand_tcp")
     )
@@ -64,5 +64,5 @@ def test_the_hand_moves_the_share_of_what_is_asked_for_that_the_contract_says(ch
         turn = env.privileged_state()["tcp_pose"][3:]
         places.append([*env.agent_state()[:3], 2 * np.arctan2(turn[2], turn[1])][channel])
     env.close()
-    share = describe(TASKS[TASK], ())["action"]["moved_share"]
+    share = describe_task(TASKS[TASK], ())["action"]["moved_share"]
     np.testing.assert_allclose(np.diff(places)[2:] / asked, share, atol=0.02)

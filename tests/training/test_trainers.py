@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_constructskill.artifacts import disk
 from lerobot_constructskill.artifacts.store import Artifact, Store
@@ -70,9 +71,9 @@ def test_what_a_training_prints_is_on_the_disk_while_it_runs(tmp_path):
 
 def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, monkeypatch):
     """Stands in for the disk: a real one would have to be filled."""
-    store, made = Store(tmp_path), Artifact("checkpoints", {"of": "a policy"})
+    store, made = Store(tmp_path), Artifact("checkpoints", {"of": "a policy", "versions": {}})
     full = pytest.raises(MachineError, match="is full")
-    with store.claim([made]), full, writing_checkpoint(store, made) as folder:
+    with store.claim([made]), full, writing_checkpoint(store, made, ACTConfig(device="cpu")) as folder:
         folder.mkdir()
         monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
         raise RuntimeError("SafetensorError: os error 28")

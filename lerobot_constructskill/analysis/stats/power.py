@@ -76,6 +76,7 @@ def seeds_needed_for_mean(difference: float, deviation: float, alpha: float = 0.
     """
     if round(difference, 12) == 0:
         return None
+    # `solve_power` for the number itself does not converge where the difference is large.
     enough = (n for n in range(2, MOST + 1) if detectable_mean_difference(deviation, n, n, alpha) <= difference)
     return next(enough, inf)
 

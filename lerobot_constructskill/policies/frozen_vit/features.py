@@ -87,8 +87,15 @@ def _mapped(root: Path) -> Tensor:
 
 
 def _described_in(info: Mapping) -> str:
-    """The column of features that a feature set was encoded to."""
-    return next(name for name in info["features"] if name.startswith(FEATURE_PREFIX))
+    """The column of features that a feature set was encoded to.
+
+    Raises:
+        InputError: there is none.
+    """
+    for name in info["features"]:
+        if name.startswith(FEATURE_PREFIX):
+            return name
+    raise InputError(f"A data set without a column {FEATURE_PREFIX}* is no feature set: {PATCHES_FILE} is of another.")
 
 
 def _identity(root: Path, key: str, patches: np.ndarray) -> str:

@@ -367,7 +367,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             return self.pool(batch[self.config.image_key])
         raise InputError(
             f"frozen_vit needs {self.config.image_key} or {self.config.feature_key}; the batch holds: "
-            f"{', '.join(batch)}. --env.obs_type=pixels_agent_pos shows the wrist camera and the state as well."
+            f"{', '.join(batch)}. obs_type=pixels_agent_pos shows the wrist camera and the state as well."
         )
 
     def _patches(self, batch: dict[str, Tensor]) -> Tensor:

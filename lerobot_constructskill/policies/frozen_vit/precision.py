@@ -89,7 +89,7 @@ def computing_in(precision: str, device: torch.device) -> Iterator[None]:
     LeRobot wraps a policy in autocast where `use_amp` is true. Its commands also switch on TF32, in which a GPU
     multiplies numbers of float32 with 10 bits of mantissa instead of 23.
     """
-    flags = torch.backends.cuda.matmul, torch.backends.cudnn
+    flags = (torch.backends.cuda.matmul, torch.backends.cudnn) if device.type == "cuda" else ()
     before = [flag.allow_tf32 for flag in flags]
     try:
         for flag in flags:
