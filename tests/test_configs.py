@@ -22,7 +22,7 @@ from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, TakenError
 from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
@@ -304,6 +304,15 @@ def test_a_file_lies_beside_its_set_and_says_of_which_it_is(written, tmp_path):
     assert (small, large) == (tmp_path / "set_7_act.yaml", tmp_path / "set_8_act.yaml")
     assert "7 demonstrations, too few for every eighth to be held out" in small.read_text()
     assert f"{tmp_path / 'set_8'}: 8 demonstrations, 1 of them held out; 110 passes." in large.read_text()
+
+
+def test_a_file_of_the_users_is_not_written_over(written, tmp_path):
+    file = written("act", 9)
+    file.write_text(f"{file.read_text()}\n")
+    assert written("act", 9) == file, "one of its own is made anew"
+    file.write_text("batch_size: 1\n")
+    with pytest.raises(TakenError, match=f"{file} exists and was not written by constructskill-config: name another"):
+        written("act", 9)
 
 
 def test_a_set_in_lerobots_cache_or_on_the_hub_is_named_alone(tmp_path, monkeypatch):

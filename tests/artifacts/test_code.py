@@ -11,8 +11,9 @@ from lerobot_constructskill.artifacts.store import Store
 
 FILES = {
     "lerobot_policy_theirs/__init__.py": "",
-    "lerobot_policy_theirs/modeling_theirs.py": "from their_layers import Layer  # and from nothing else\n",
+    "lerobot_policy_theirs/modeling_theirs.py": "import torch, their_layers\n\ntext = '''\nfrom another page\n'''\n",
     "their_layers.py": "import numpy\n\nWIDTH = 64\n",
+    "lerobot_policy_theirs/meshes/brick.obj": "v 0 0 0\n",
     "another.py": "WIDTH = 64\n",
 }
 DEFINES = "lerobot_policy_theirs.modeling_theirs"
@@ -21,7 +22,7 @@ DEFINES = "lerobot_policy_theirs.modeling_theirs"
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch):
     for name, text in FILES.items():
-        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
     return tmp_path

@@ -153,6 +153,11 @@ def test_a_card_of_metadata_without_its_numbers_is_refused_in_one_sentence(file,
         card_facts(open_dataset(copy))
 
 
+def test_a_set_of_another_packages_task_says_what_its_source_is(copy):
+    emptied(copy, SIDECAR, lambda facts: facts["versions"].update(lintel_task="0.1.0, source 2c26b46b68ff"))
+    assert "lintel_task 0.1.0, source 2c26b46b68ff" in render(card_facts(open_dataset(copy)))
+
+
 @pytest.mark.parametrize(
     "folder", sorted(path.parent for path in CARDS.glob("*/README.md")), ids=lambda path: path.name
 )

@@ -304,6 +304,10 @@ def test_vector_environments_follow_lerobots_contract(use_async_envs, fresh_fork
         again, _ = vector.reset(seed=[7, 8])
         np.testing.assert_array_equal(again["agent_pos"], obs["agent_pos"])
         assert not np.any(vector.step(np.stack([HOVER, HOVER]))[2:4])
+        while not vector.step(np.stack([HOVER, HOVER]))[3].all():
+            pass
+        vector.reset(options={"reset_mask": np.array([True, False])})
+        assert vector.step(np.stack([HOVER, HOVER]))[3].tolist() == [False, True]
         if use_async_envs:  # a worker that inherits CUDA can use neither it nor Vulkan on a GPU
             with ProcessPoolExecutor(1, get_context("forkserver")) as pool:
                 assert not pool.submit(cannot_use_cuda).result()
