@@ -5,6 +5,7 @@ must agree on is written once. Geometry of a task's own assets stands in its sce
 as privileged state.
 """
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from math import pi
@@ -127,6 +128,26 @@ OBS_TYPES = {"pixels": ("base",), "pixels_agent_pos": ("base", "wrist")}
 """Cameras of each `obs_type`; `pixels_agent_pos` adds the 8-number state as well."""
 
 
+LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}
+"""The tolerance ladder: task name to the total clearance in x and in y, in metres."""
+
+SUITES = {
+    "bins": ("brick_to_bin", "brick_to_bin_shifted", "block_to_bin"),
+    "ladder": tuple(LADDER),
+    "joints": ("brick_on_brick", "tile_to_grid", "tenon_to_mortise"),
+}
+"""Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
+
+FIELDS = {
+    "name": f"it is lower-case letters, digits and underscores, and none of the suites {', '.join(SUITES)}",
+    "horizon": "it is a whole number of steps from 1 on",
+    "scene": "it is module:class",
+    "expert": "it is module:class",
+    "action_names": f"they are {', '.join(TRANSLATION)}, some of {', '.join(ROTATION)}, and {GRIPPER} last",
+}
+"""What fields of a task must be."""
+
+
 @dataclass(frozen=True)
 class Task:
     """One row of the table.
@@ -154,6 +175,18 @@ class Task:
     noisy_yield: float = 0.9
     is_brick: bool = False
 
+    def __post_init__(self):
+        wrong = {
+            "name": not re.fullmatch(r"[a-z0-9_]+", str(self.name)) or self.name in SUITES,
+            "horizon": not isinstance(self.horizon, int) or self.horizon < 1,
+            "scene": not re.fullmatch(r"[\w.]+:\w+", str(self.scene)),
+            "expert": not re.fullmatch(r"[\w.]+:\w+", str(self.expert)),
+            "action_names": self.action_names[-1:] != (GRIPPER,)
+            or not {*TRANSLATION} <= {*self.action_names} <= {*TRANSLATION, *ROTATION, GRIPPER},
+        }
+        if field := next((name for name, is_wrong in wrong.items() if is_wrong), None):
+            raise InputError(f"The task {self.name!r} cannot have {field} {getattr(self, field)!r}: {FIELDS[field]}.")
+
 
 _PICK_PLACE = "lerobot_constructskill.demos.pick_place:PickPlaceExpert"
 _PRECISE = "lerobot_constructskill.demos.precise:PreciseExpert"
@@ -162,9 +195,6 @@ _SCENES = "lerobot_constructskill.sim.tasks"
 
 BRICK = (0.21, 0.065, 0.10)
 """Size of the paper's brick as it stands, in metres: Waaldickformat, on its long narrow face."""
-
-LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}
-"""The tolerance ladder: task name to the total clearance in x and in y, in metres."""
 
 SHIPPED = {
     task.name: task
@@ -258,7 +288,7 @@ def _all_tasks() -> dict[str, Task]:
     owners = {key: "lerobot_constructskill" for task in SHIPPED.values() for key in (task.name, task.env_id)}
     for package, task in offered(Task):
         for key in (task.name, task.env_id):
-            if key in owners:
+            if key in owners and tasks.get(task.name) != task:
                 raise InputError(
                     f"The packages '{owners[key]}' and '{package}' both have a task '{key}': uninstall one, or give "
                     "its task another name and env_id."
@@ -286,13 +316,6 @@ def get_task(name: str) -> Task:
         raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}.")
     return tasks[name]
 
-
-SUITES = {
-    "bins": ("brick_to_bin", "brick_to_bin_shifted", "block_to_bin"),
-    "ladder": tuple(LADDER),
-    "joints": ("brick_on_brick", "tile_to_grid", "tenon_to_mortise"),
-}
-"""Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
 
 LOOSE = "constructskill"
 """The suite under which results of tasks that were named one by one are kept."""

@@ -24,7 +24,7 @@ def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
     for point in sorted(entry_points(group=GROUP), key=lambda point: (_package(point), point.name)):
         try:
             rows = _load(point, kind)
-        except Exception as error:  # whatever the code of another package may raise
+        except (Exception, SystemExit) as error:  # whatever the code of another package may raise
             if parent_process() is None:  # workers would repeat it
                 logger.warning("The tasks of the package '%s' are left out: %s", _package(point), _said(point, error))
             continue

@@ -79,7 +79,7 @@ class Offer:
         return self
 
     def load(self) -> Any:
-        if isinstance(self.found, Exception):
+        if isinstance(self.found, BaseException):
             raise self.found
         return self.found
 
@@ -121,6 +121,22 @@ def test_demonstrations_of_an_edited_scene_are_others(install, tmp_path, monkeyp
     assert all(before != after for before, after in zip(*found, strict=True))
 
 
+@pytest.mark.parametrize(
+    "field",
+    [
+        *({"name": name} for name in ("joints", "a,b", "", "../esc")),
+        *({"action_names": names} for names in (("gripper", "dx"), ("x", "gripper"), ())),
+        *({"horizon": horizon} for horizon in ("ten", 0)),
+        *({part: None} for part in ("scene", "expert")),
+    ],
+    ids=str,
+)
+def test_a_row_that_nothing_can_be_made_of_is_refused_by_its_field(field):
+    (name,) = field
+    with pytest.raises(InputError, match=f"cannot have {name} "):
+        replace(row("lay"), **field)
+
+
 @pytest.mark.parametrize("second", [row("lay", "Other-v1"), row("other", "lay-v1"), row("brick_to_bin")])
 def test_two_packages_with_one_task_are_refused_by_their_names(install, second):
     install(one=row("lay"), two=second)
@@ -128,7 +144,9 @@ def test_two_packages_with_one_task_are_refused_by_their_names(install, second):
         contract.get_task("brick_to_bin")
 
 
-@pytest.mark.parametrize("broken", [ImportError("no module named that\nsecond line"), [row("lay"), "lay"], 7])
+@pytest.mark.parametrize(
+    "broken", [ImportError("no module named that\nsecond line"), SystemExit(3), [row("lay"), "lay"], 7]
+)
 def test_a_package_that_cannot_be_loaded_is_left_out_with_one_sentence(install, caplog, broken):
     install(good=row("turn"), bad=broken)
     with caplog.at_level(logging.WARNING):

@@ -8,30 +8,52 @@ import ast
 import hashlib
 import re
 import sys
+import warnings
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.digests import file_sha256, installed
+from lerobot_constructskill.errors import MachineError
 
 BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
 """Top-level packages of which the version says enough, LeRobot's and our own among them."""
+
+_LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$)")
+"""Files beside a package's own: hidden ones, bytecode, logs, and what editors leave for as long as a file is open."""
 
 
 def code_of(*names: str) -> dict[str, str]:
     """What the code of some modules is, by the name of its distribution.
 
     LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
-    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the top-level package but bytecode,
-    so meshes and settings too, and of packages that it imports and that are of the same distribution, or of none.
-    Other distributions that it imports are not told.
+    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the top-level package, meshes and
+    settings too, but for `_LEFT_OUT`; and of packages that it imports and that are of the same distribution, or of
+    none. Other distributions that it imports are not told.
 
     Args:
         names: modules, or classes as `module:class`.
     """
     packages = {re.split(r"[.:]", name)[0] for name in names} - BY_VERSION
     return dict(_told(package) for package in sorted(packages) if _files(package))
+
+
+def check_unedited(before: Mapping[str, str], now: Mapping[str, str]) -> None:
+    """Let nothing be written under the name of what some code was before somebody edited it.
+
+    Args:
+        before, now: package to version and source.
+
+    Raises:
+        MachineError: they differ.
+    """
+    if changed := [name for name, code in now.items() if before.get(name) != code]:
+        raise MachineError(
+            f"{changed[0]} is not what it was when this began: it was edited, or this machine has another copy. "
+            "The same command makes what is missing with what it is now."
+        )
 
 
 def _told(package: str) -> tuple[str, str]:
@@ -46,8 +68,13 @@ def _source_sha256(package: str) -> str:
     for name in sorted(_with_helpers(package)):
         for relative, path in sorted(_files(name).items()):
             total.update(f"{name}/{relative}".encode())
-            total.update(bytes.fromhex(file_sha256(path)))
+            total.update(bytes.fromhex(_sha256(path, path.stat().st_size, path.stat().st_mtime_ns)))
     return total.hexdigest()
+
+
+@cache
+def _sha256(path: Path, size: int, mtime_ns: int) -> str:
+    return file_sha256(path)
 
 
 def _with_helpers(package: str) -> set[str]:
@@ -57,16 +84,18 @@ def _with_helpers(package: str) -> set[str]:
         for path in _files(unread.pop()).values():
             imported = _imported(path) - BY_VERSION - found
             helpers = {name for name in imported if _distribution(name) in (None, _distribution(package))}
+            helpers = {name for name in helpers if _is_written(name)}
             found |= helpers
-            unread += [name for name in helpers if _files(name)]
+            unread += helpers
     return found
 
 
 def _imported(path: Path) -> set[str]:
     """The top-level packages that a file of Python imports."""
     try:
-        nodes = [*ast.walk(ast.parse(path.read_bytes()))] if path.suffix == ".py" else []
-    except (SyntaxError, ValueError):  # somebody is at work on it
+        with warnings.catch_warnings(action="ignore"):  # of another's code
+            nodes = [*ast.walk(ast.parse(path.read_bytes()))] if path.suffix == ".py" else []
+    except (SyntaxError, ValueError, RecursionError, MemoryError):  # half written, or too deep for the parser
         return set()
     names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     names += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module]
@@ -84,6 +113,11 @@ def _distribution(package: str) -> str | None:
 _distributions = cache(packages_distributions)
 
 
+def _is_written(package: str) -> bool:
+    """Whether somebody wrote a module or package of this name; any folder on the path would pass for one."""
+    return any(path.name in ("__init__.py", f"{package}.py") for path in _files(package).values())
+
+
 def _files(package: str) -> dict[str, Path]:
     """The files of a top-level package or module, by relative path; none where there is no such thing."""
     try:
@@ -91,12 +125,8 @@ def _files(package: str) -> dict[str, Path]:
     except (ImportError, ValueError):  # the latter of `__main__`
         spec = None
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
-    found = {
-        path.relative_to(folder).as_posix(): path
-        for folder in folders
-        for path in folder.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
+    inside = {path.relative_to(folder).as_posix(): path for folder in folders for path in folder.rglob("*")}
+    found = {name: path for name, path in inside.items() if path.is_file() and not _LEFT_OUT.search(name)}
     if spec and spec.origin and spec.origin.endswith(".py"):
         found.setdefault(Path(spec.origin).name, Path(spec.origin))
     return found

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -88,8 +89,8 @@ def judged(a: Side, b: Side, conditions: Conditions, starts: Sequence[int], alph
 
 
 def _check_asked(a: Found, b: Found, asked: Asked) -> None:
-    if a == b:
-        raise InputError(f"'{a.name}' is both sides; name another for one of them.")
+    if a.arm == b.arm and (both := {*map(Path.resolve, a.folders)} & {*map(Path.resolve, b.folders)}):
+        raise InputError(f"'{min(both)}' is on both sides; name another for one of them.")
     kinds = {a.kind, b.kind}
     if asked.seed is not None and EVALUATED not in kinds and kinds != {CHECKPOINT}:
         raise InputError("The starts of these sides are known: leave out --seed.")

@@ -48,7 +48,8 @@ def read_study(root: Path, arm: str) -> Side:
 
 def _env(root: Path, setting: str) -> dict:
     try:
-        return yaml.safe_load((root / STUDY).read_text())["settings"][setting]["env"]
+        env = yaml.safe_load((root / STUDY).read_text())["settings"][setting]["env"]
+        return {**env, "task": env["task"]}
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
         raise InputError(f"{root / STUDY} does not say how '{setting}' is evaluated ({error!r}).") from None
 
@@ -127,7 +128,7 @@ def read_evaluated(name: str, folders: Sequence[Path], first_start: int | None, 
 def _successes(file: Path, task: str | None, label: str) -> list[bool]:
     try:
         results = {
-            (one["task_group"], one["task_id"]): [bool(success) for success in one["metrics"]["successes"]]
+            (str(one["task_group"]), int(one["task_id"])): [bool(success) for success in one["metrics"]["successes"]]
             for one in json.loads(file.read_text())["per_task"]
         }
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -137,7 +138,7 @@ def _successes(file: Path, task: str | None, label: str) -> list[bool]:
     if len(ours) == 1 and next(iter(ours))[0] == f"{LOOSE}{label}":
         return next(iter(ours.values()))
     for (suite, number), own in ours.items():
-        if suite in suites and suites[suite][number] == task:
+        if suites.get(suite, ())[number : number + 1] == (task,):
             return own
     found = ", ".join(f"{suite} {number}" for suite, number in results)
     raise InputError(f"{file} has no result that is of {task or 'one task'}{label} for certain; it has: {found}.")

@@ -55,7 +55,7 @@ def _sides(comparison: Comparison) -> str:
     lines.append(f"in {comparison.conditions}; {tell_starts(comparison.starts)} ({n})")
     for letter, side in (("A", comparison.a), ("B", comparison.b)):
         if side.env is None:
-            lines.append(f"lerobot-eval does not write where it evaluated: {letter} is taken to be as the other side")
+            lines.append(f"lerobot-eval does not write where it evaluated: {letter} is taken to be from there")
     return "\n".join(lines)
 
 
@@ -77,7 +77,7 @@ def _row(letter: str, counts: Counts, mean: Estimate, rates: list[float], side: 
 
 def _verdict(judgement: Judgement, alpha: float) -> str:
     apart = judgement.difference
-    interval = f"{1 - alpha:.0%} interval {apart.low * 100:+.0f} to {apart.high * 100:+.0f}"
+    interval = f"{100 * (1 - alpha):g} % interval {apart.low * 100:+.0f} to {apart.high * 100:+.0f}"
     return (
         f"{VERDICTS[judgement.verdict]}\n"
         f"A - B: {apart.value * 100:+.1f} points ({interval}); p = {_p(judgement.p_value)}, permutation of seeds.\n"
@@ -101,12 +101,11 @@ def _power(judgement: Judgement, alpha: float) -> str:
     if judgement.smallest_p_value >= alpha:
         return (
             f"{plural(a, 'seed')} against {b} can show no difference, however large: their p-value is at least "
-            f"{judgement.smallest_p_value:.2f}. Train more seeds."
+            f"{judgement.smallest_p_value:.2g}. Train more seeds."
         )
-    visible = [
-        (judgement.visible, "if seeds vary as these do"),
-        (judgement.visible_at_worst, "if each seed places always or never"),
-    ]
+    visible = [(judgement.visible_at_worst, "if each seed places always or never")]
+    if judgement.visible is not None:
+        visible.insert(0, (judgement.visible, "if seeds vary as these do"))
     told = "; ".join(f"{_points(difference)}, {condition}" for difference, condition in visible)
     return " ".join([f"With this many seeds, {TARGET:.0%} of comparisons would find: {told}.", *_needed(judgement)])
 

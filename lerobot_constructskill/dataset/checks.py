@@ -40,7 +40,7 @@ REACH = 1.2
 """Farthest that the Panda's end effector gets from its base, in metres."""
 
 RESPONSE = (0.15, 0.8)
-"""Displacement of the end effector for each metre asked for; the simulated arm moves 0.30 to 0.36."""
+"""Displacement of the end effector for each metre asked for; over whole demonstrations it is 0.30 to 0.36."""
 
 HARDLY_ASKED = 0.1
 """An axis that is asked for less than this share of the strongest one moves by the arm's sag: no response to judge."""

@@ -144,7 +144,9 @@ def choose_held_out(
         InputError: there are none, the data set has not all of them, or a checkpoint has seen one that nobody named.
     """
     chosen = held_out(dataset.num_episodes) if episodes is None else episodes
-    if not chosen or not set(chosen) <= set(range(dataset.num_episodes)):
+    if not chosen:
+        raise InputError("Of fewer than eight demonstrations none is held out: name some by --episodes.")
+    if not set(chosen) <= set(range(dataset.num_episodes)):
         raise InputError(f"Held-out episodes must be among 0 to {dataset.num_episodes - 1}, not {chosen}.")
     for checkpoint in checkpoints if episodes is None else ():
         if (learnt := trained_on(Path(checkpoint), dataset)) is None:

@@ -65,7 +65,7 @@ def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
         told = ", ".join(f"{k} of {n}" for k, n in counts)
         raise InputError(
             f"LeRobot holds out the same share of each task, but every eighth demonstration of this set is {told} of "
-            "its tasks: train on a set of each task, or on one with equally many demonstrations of each."
+            "its tasks: train on a set of each task, or on one with equally many of each, in blocks of eight."
         )
     last = sorted(range(len(lengths)), key=out.__contains__)  # stable: both parts stay in order
     return Split(last, len(out), (low + high) / 2 if out else 0.0, frames)

@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.disk import disk_of, room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
-from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
+from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
@@ -58,7 +59,9 @@ def record(config: GenerateConfig) -> Summary:
 def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
     """Write the data set to a path that `staged` gave, by way of shards beside it. Raises as `record` does."""
     shards = folder.with_name(SHARDS) / frames_digest(config)
+    before = frame_versions(config.task)
     attempts = _run_attempts(config, shards)
+    check_unedited(before, frame_versions(config.task))
     with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet(), room_for(folder):
         merge(config, attempts, shards, folder)
     return attempts

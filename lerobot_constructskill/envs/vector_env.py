@@ -64,8 +64,10 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         """Start an episode in every environment; an integer seeds environment i with `seed + i`.
 
         Raises:
-            InputError: there is not one seed for each environment.
+            InputError: there is not one seed for each environment, or only some are to be reset.
         """
+        if "reset_mask" in (options or {}):
+            raise InputError("Environments that share a simulator begin together: leave out reset_mask.")
         if isinstance(seed, Integral):
             super().reset(seed=int(seed))
             seed = range(seed, seed + self.num_envs)

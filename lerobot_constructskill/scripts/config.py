@@ -1,5 +1,6 @@
 """`constructskill-config`: list our configurations, print the path of one, or write one of training for a data set."""
 
+import os
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -51,7 +52,7 @@ class TrainingFile:
     def file(self) -> Path:
         if self.out is not None:
             return self.out
-        beside = self.root.absolute() if self.root else Path("outputs") / self.repo_id.partition("/")[2]
+        beside = Path(os.path.abspath(self.root)) if self.root else Path("outputs") / self.repo_id.partition("/")[2]
         return beside.with_name(f"{beside.name}_{self.name}.yaml")
 
 

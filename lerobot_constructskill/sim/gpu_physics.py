@@ -10,7 +10,7 @@ from lerobot_constructskill.errors import InputError, MachineError, first_line
 BACKENDS = ("gpu", "cuda", "physx_cuda")
 """ManiSkill's names of it."""
 
-_WANTED = "Several environments in one simulator need a GPU"
+_WANTED = "Several environments in one simulator, or sim_backend=gpu, need a GPU"
 _INSTEAD = "use num_envs=1 and sim_backend=auto, or a process each, as --env.vectorization=process does"
 
 

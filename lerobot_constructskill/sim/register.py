@@ -18,10 +18,11 @@ def register(task: Task) -> None:
     module = task.scene.partition(":")[0]
     try:
         import_module(module)
-    except Exception as error:  # whatever the code of another package may raise
+    except (Exception, SystemExit) as error:  # whatever the code of another package may raise
         said = f"{type(error).__name__}: {first_line(error)}"
         raise InputError(f"The scene of the task '{task.name}', {task.scene}, cannot be imported ({said}).") from error
-    if task.env_id not in REGISTERED_ENVS:
+    made = REGISTERED_ENVS.get(task.env_id)
+    if made is None or made.cls.__module__ != module:
         raise InputError(
             f"The scene of the task '{task.name}', {task.scene}, does not register {task.env_id} with ManiSkill: "
             "decorate its class with @register_env."

@@ -17,6 +17,7 @@ import httpx
 import torch
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
@@ -33,7 +34,7 @@ from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.runs import Demonstrations, Run
 from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
-from lerobot_constructskill.training.checkpoints import check_unedited, read_facts, writing_checkpoint
+from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.training.trainers import OF_THE_MACHINE, trainer_of
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"

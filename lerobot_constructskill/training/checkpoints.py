@@ -10,11 +10,12 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils import OBS_STATE
 
+from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import OBS_TYPES
-from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
@@ -78,22 +79,6 @@ def writing_checkpoint(store: Store, checkpoint: Artifact, policy: PreTrainedCon
         yield folder
         check_unedited(checkpoint.spec["versions"], versions_of(policy))
         (folder / FACTS).write_text(json.dumps(facts) + "\n")
-
-
-def check_unedited(before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Let nothing be written under the name of what some code was before somebody edited it.
-
-    Args:
-        before, now: package to version and source.
-
-    Raises:
-        MachineError: they differ.
-    """
-    if changed := [name for name, code in now.items() if before.get(name) != code]:
-        raise MachineError(
-            f"{changed[0]} is not what it was when this began: it was edited, or this machine has another copy. "
-            "The same command makes what is missing with what it is now."
-        )
 
 
 def read_facts(checkpoint: Path) -> dict:

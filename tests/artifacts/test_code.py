@@ -39,6 +39,31 @@ def install(folder: Path) -> None:
     metadata.write_text("Metadata-Version: 2.1\nName: lerobot_policy_theirs\nVersion: 1.2\n")
 
 
+BESIDE = (".modeling_theirs.py.swp", "4913", "modeling_theirs.py~", "run.log", ".git/index", "__pycache__/a.pyc")
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_what_an_editor_or_a_run_leaves_beside_code_is_none_of_it(name, folder):
+    before, file = told(), folder / "lerobot_policy_theirs" / name
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("open")
+    assert told() == before
+
+
+def test_a_folder_called_like_an_absent_package_is_no_code(folder):
+    (folder / "their_layers.py").write_text("try:\n    import wandb\nexcept ImportError:\n    wandb = None\n")
+    before = told()
+    (folder / "wandb").mkdir()
+    (folder / "wandb" / "run.json").write_text("{}")
+    assert told() == before
+
+
+def test_what_cannot_be_parsed_is_hashed_all_the_same(folder):
+    before = told()
+    (folder / "their_layers.py").write_text(f"x = {'-' * 20_000}1\n")
+    assert told() != before
+
+
 @pytest.mark.parametrize("is_installed", [True, False])
 def test_code_is_told_by_its_source_on_a_path_or_installed(is_installed, folder):
     if is_installed:

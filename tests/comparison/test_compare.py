@@ -128,7 +128,7 @@ def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
     for text, said in refusals.items():
         with pytest.raises((InputError, MissingError), match=said):
             compared(text, published)
-    with pytest.raises(InputError, match="is both sides"):
+    with pytest.raises(InputError, match="is on both sides"):
         compared(published, published)
     with pytest.raises(InputError, match="Every training seed of '.*' failed, so there is nothing"):
         compared(published, study([None, None], "failed"))
@@ -167,8 +167,8 @@ def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, 
     assert "This number of seeds does not show which of them is better." in one
     assert "They differ in torch (" in one and "Only B says lerobot 0.6.1; processor a CPU." in one
     few = compare(CompareConfig(evaluated(GOOD[:3]), study(BAD[:3], "few"), seed=1000))
-    assert "3 seeds against 3 can show no difference, however large: their p-value is at least 0.10." in few
-    assert "does not write where it evaluated: A is taken to be as the other side" in few
+    assert "3 seeds against 3 can show no difference, however large: their p-value is at least 0.1." in few
+    assert "does not write where it evaluated: A is taken to be from there" in few
     assert "Only B says lerobot 0.6.1" in few
 
 

@@ -51,7 +51,7 @@ def test_one_native_copy_equals_the_ordinary_environment_beyond_the_end():
 @pytest.mark.sim
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_several_copies_without_a_gpu_are_refused():
-    with pytest.raises(OSError, match="Several environments in one simulator need a GPU"):
+    with pytest.raises(OSError, match="Several environments in one simulator, or sim_backend=gpu, need a GPU"):
         NativeVectorEnv(2, **KWARGS).reset(seed=[0, 1])
 
 

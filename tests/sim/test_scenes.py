@@ -207,7 +207,7 @@ def test_gpu_physics_that_cannot_be_had_is_refused_in_one_sentence(render_backen
     monkeypatch.setattr(gpu_physics.sapien, "Device", lambda name: name)
     monkeypatch.setattr(gpu_physics.physx, "enable_gpu", enable_gpu)
     monkeypatch.setattr(scene, "best_render_backend", lambda: "gpu")
-    with pytest.raises(UserError, match=f"^Several environments in one simulator need a GPU.* {said}") as told:
+    with pytest.raises(UserError, match=f"^Several environments .* need a GPU.* {said}") as told:
         make("block_to_bin", num_envs=2, render_backend=render_backend)
     assert "\n" not in str(told.value)
 

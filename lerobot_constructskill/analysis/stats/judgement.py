@@ -13,7 +13,7 @@ from lerobot_constructskill.analysis.stats.power import (
     detectable_mean_difference,
     seeds_needed_for_mean,
 )
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate
+from lerobot_constructskill.analysis.stats.spread import PERMUTATIONS, mean_p_value, mean_rate
 
 
 class Judgement(NamedTuple):
@@ -79,7 +79,8 @@ def smallest_p_value(seeds_a: int, seeds_b: int) -> float:
     """The p-value of a permutation of seeds where each of one side's did better than all of the other's."""
     if min(seeds_a, seeds_b) < 2:
         return 1.0
-    return (1 + (seeds_a == seeds_b)) / comb(seeds_a + seeds_b, seeds_a)
+    exact = (1 + (seeds_a == seeds_b)) / comb(seeds_a + seeds_b, seeds_a)
+    return max(exact, 1 / (PERMUTATIONS + 1))  # of random permutations, where there are too many to try all
 
 
 def mean_difference(a: Estimate, b: Estimate) -> Estimate:
