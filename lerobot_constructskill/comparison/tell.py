@@ -111,7 +111,7 @@ def _power(judgement: Judgement, alpha: float) -> str:
 
 
 def _points(difference: float | None) -> str:
-    return f"a difference of {difference * 100:.0f} points" if difference and difference <= 1 else "no difference"
+    return f"a difference of {difference * 100:.0f} points" if difference and difference <= 1 else "no difference, however large"
 
 
 def _needed(judgement: Judgement) -> list[str]:
