@@ -68,8 +68,14 @@ def _source_sha256(package: str) -> str:
     for name in sorted(_with_helpers(package)):
         for relative, path in sorted(_files(name).items()):
             total.update(f"{name}/{relative}".encode())
-            total.update(bytes.fromhex(_sha256(path, path.stat().st_size, path.stat().st_mtime_ns)))
+            total.update(bytes.fromhex(_sha256(*_stamp(path))))
     return total.hexdigest()
+
+
+def _stamp(path: Path) -> tuple[Path, int, int]:
+    """A file as it is now: what is known of it holds until its size or its time changes."""
+    status = path.stat()
+    return path, status.st_size, status.st_mtime_ns
 
 
 @cache
@@ -82,7 +88,7 @@ def _with_helpers(package: str) -> set[str]:
     found, unread = {package}, [package]
     while unread:
         for path in _files(unread.pop()).values():
-            imported = _imported(path) - BY_VERSION - found
+            imported = _imported(*_stamp(path)) - BY_VERSION - found
             helpers = {name for name in imported if _distribution(name) in (None, _distribution(package))}
             helpers = {name for name in helpers if _is_written(name)}
             found |= helpers
@@ -90,7 +96,8 @@ def _with_helpers(package: str) -> set[str]:
     return found
 
 
-def _imported(path: Path) -> set[str]:
+@cache
+def _imported(path: Path, size: int, mtime_ns: int) -> set[str]:
     """The top-level packages that a file of Python imports."""
     try:
         with warnings.catch_warnings(action="ignore"):  # of another's code

@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.comparison.sides import MAKER, Conditions, Side, merge_versions
-from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, write_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
@@ -47,7 +47,8 @@ def evaluate(
             packages = versions(*ACTING) | versions_of(agent.policy.config)
             told.append(packages | {"processor": processor(), MAKER: make(), "backend": rollout.backend})
             if kept_in is not None:
-                _keep(rollout, env, kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}")
+                folder = kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}"
+                write_recordings(rollout.recordings(vars(Conditions.of(env))), folder / RECORDINGS)
     kind = f"{plural(len(checkpoints), 'checkpoint')}, evaluated now"
     return Side(name, kind, env, seeds, merge_versions(told))
 
@@ -73,12 +74,3 @@ def _label(checkpoint: Path) -> str:
     """The folder that tells a checkpoint from those of other seeds, such as seed_0."""
     names = [part for part in checkpoint.absolute().parts if part not in ("checkpoints", "last", "pretrained_model")]
     return names[-1]
-
-
-def _keep(rollout: Rollout, env: Mapping[str, Any], folder: Path) -> None:
-    facts = {name: value for name, value in vars(Conditions.of(env)).items() if name in STARTING}
-    episodes = zip(rollout.episodes, rollout.actions, strict=True)
-    write_recordings(
-        [Recording.of(episode, actions, backend=rollout.backend, **facts) for episode, actions in episodes],
-        folder / RECORDINGS,
-    )

@@ -111,7 +111,9 @@ def _power(judgement: Judgement, alpha: float) -> str:
 
 
 def _points(difference: float | None) -> str:
-    return f"a difference of {difference * 100:.0f} points" if difference and difference <= 1 else "no difference, however large"
+    if not difference or difference > 1:
+        return "no difference, however large"
+    return f"a difference of {difference * 100:.0f} points"
 
 
 def _needed(judgement: Judgement) -> list[str]:

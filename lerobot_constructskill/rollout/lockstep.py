@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.contract import OBS_TYPES, get_task
-from lerobot_constructskill.envs.recording import Outcome
+from lerobot_constructskill.envs.recording import STARTING, Outcome, Recording
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
@@ -38,6 +38,11 @@ class Rollout:
     actions: list[list[np.ndarray]] = field(default_factory=list)
     error: Exception | None = None
     backend: str | None = None
+
+    def recordings(self, env_kwargs: Mapping[str, Any]) -> list[Recording]:
+        """What was executed, an episode each; `env_kwargs` have all of `recording.STARTING`."""
+        facts = {name: env_kwargs[name] for name in STARTING} | {"backend": self.backend}
+        return [Recording.of(*pair, **facts) for pair in zip(self.episodes, self.actions, strict=True)]
 
 
 def roll_out(

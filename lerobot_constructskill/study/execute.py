@@ -25,7 +25,7 @@ from lerobot_constructskill.contract import get_task, held_out
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.run import make_checkpoint
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
-from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, write_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
@@ -177,10 +177,7 @@ def _agent(job: Job, run: Run) -> Agent:
 def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     row = _row(job, run, rollout.backend)
     rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
-    start = {name: run.arm.env[name] for name in STARTING}
-    told = {"backend": rollout.backend, **start}
-    pairs = zip(rollout.episodes, rollout.actions, strict=True)
-    return _write(job, run, rows, write_video, [Recording.of(episode, actions, **told) for episode, actions in pairs])
+    return _write(job, run, rows, write_video, rollout.recordings(run.arm.env))
 
 
 def _write_failed(job: Job, run: Run, error: Exception) -> Run:
