@@ -3,6 +3,8 @@
 A reset builds the scene anew, as an episode has to know nothing of the one before it. Against it: the same worker
 whose garbage collector looks at all that was imported, as ManiSkill has it do whenever a scene ends. They take turns,
 each in a process of its own, with and without rendering (one camera).
+
+Also the first picture of a process, against SAPIEN's own shader, which has a table computed for it.
 """
 
 import os
@@ -38,6 +40,30 @@ def seconds_a_reset(spare_imports: bool, render_backend: str) -> float:
     return (time.process_time() - start) / EPISODES
 
 
+def seconds_to_the_first_picture(own_shader: bool) -> float:
+    """CPU seconds of the first reset of this process, whose imports are done."""
+    import lerobot_constructskill.sim.register  # noqa: F401
+    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+    from lerobot_constructskill.sim import scene
+
+    if not own_shader:
+        scene.colour_shader = lambda: None
+    env = ConstructSkillEnv("brick_to_bin_shifted", render_backend="cpu")
+    start = time.process_time()
+    env.reset(seed=0)
+    return time.process_time() - start
+
+
+def first_pictures() -> None:
+    seconds = {True: 0.0, False: 0.0}
+    for _ in range(TURNS):
+        for own_shader in seconds:
+            with ProcessPoolExecutor(1, get_context("spawn")) as worker:
+                seconds[own_shader] += worker.submit(seconds_to_the_first_picture, own_shader).result() / TURNS
+    what = "first pictures of a process per second of CPU time"
+    report(what, 1 / seconds[True], "SAPIEN's own shader", 1 / seconds[False])
+
+
 def main() -> None:
     os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     for render_backend, what in (("cpu", "rendering"), ("none", "without rendering, as in a replay")):
@@ -48,6 +74,7 @@ def main() -> None:
                     seconds[name] += worker.submit(seconds_a_reset, name == OURS, render_backend).result() / TURNS
         rates = {name: 1 / taken for name, taken in seconds.items()}
         report(f"resets per second of CPU time, {what}", rates[OURS], ALL_OBJECTS, rates[ALL_OBJECTS])
+    first_pictures()
 
 
 if __name__ == "__main__":
