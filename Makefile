@@ -1,11 +1,12 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds test check bench dist docs image pins
+.PHONY: help setup demo ten-seeds check test bench dist docs image pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
 
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
-PARALLEL := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=20
+PYTEST := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest
+PARALLEL := $(PYTEST) -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=20
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -21,7 +22,7 @@ ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study,
 	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
 
 test: setup ## every test
-	@./setup.sh browser
+	@./setup.sh chromium
 	$(PARALLEL)
 
 check: setup ## lint, and the tests that need neither simulator nor training
@@ -42,5 +43,6 @@ image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BA
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
-pins: ## resolve pyproject.toml afresh into constraints.txt
-	@./setup.sh pins
+pins: setup ## resolve pyproject.toml afresh into constraints.txt, for x86-64 Linux and Python 3.12
+	PATH="$$PWD/.venv-uv/bin:$$PATH" uv pip compile pyproject.toml --quiet --upgrade --all-extras --python-version 3.12 \
+		--no-annotate --custom-compile-command="make pins" --output-file constraints.txt
