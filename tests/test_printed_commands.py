@@ -94,6 +94,7 @@ def keep_resnet(folder: Path) -> None:
     torch.save(resnet18().state_dict(), folder / Path(ResNet18_Weights.IMAGENET1K_V1.url).name)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("page", to_run())
 def test_the_commands_of_a_page_run(page, reader):
     folder, environment = reader

@@ -18,7 +18,7 @@ from printed import PAGES, ROOT
 from lerobot_constructskill.contract import SHIPPED
 
 pytest.importorskip("material", reason="the extra `docs` builds the site")
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 LARGEST = 16e6
 """Bytes of the whole site."""

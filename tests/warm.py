@@ -2,7 +2,8 @@
 
 `python warm.py <socket>` is that process. A command is a wrapper in a folder of its own (`write_wrappers`), to be
 started like the true one: it hands its arguments, environment, folder and streams to the process, and ends as the fork
-does. Where a variable differs that is read while modules are imported, it becomes the true command instead.
+does. Where a variable differs that is read while modules are imported, it becomes the true command instead. What a
+command starts by its place beside `sys.executable`, as a study does `lerobot-train`, starts warm as well.
 """
 
 import gc
@@ -24,6 +25,9 @@ PRELOADED = (
 )
 """None of them starts a thread, which a fork would lack, but pyarrow, whose own minds its memory."""
 
+CODE = "code"
+"""A command that is no console command: its first argument is code, as that of `python -c`."""
+
 READ_BY_IMPORTS = ("HF_", "HOME", "MKL_", "OMP_", "PYTHON", "TRANSFORMERS_", "XDG_CACHE_HOME")
 """How variables start that modules read while they are imported."""
 
@@ -42,6 +46,8 @@ sys.exit(int(answer or 1))
 
 def write_wrappers(names: Sequence[str], folder: Path, address: Path, true: Path) -> None:
     """Write a wrapper into `folder` for each command; the true ones lie in `true`."""
+    (folder / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    (folder / "python").chmod(0o755)
     for name in names:
         said = WRAPPER.format(python=sys.executable, address=address, name=name, true=true / name)
         (folder / name).write_text(said)
@@ -88,6 +94,7 @@ def answer(warm: socket.socket, ours: dict[str, str]) -> None:
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
         os.close(stream)
+    sys.path[1:1] = [path for path in paths(environment) if path not in sys.path]
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
@@ -95,13 +102,23 @@ def answer(warm: socket.socket, ours: dict[str, str]) -> None:
 
 
 def imported_with(environment: dict[str, str]) -> dict[str, str]:
-    return {name: value for name, value in environment.items() if name.startswith(READ_BY_IMPORTS)}
+    read = {name: value for name, value in environment.items() if name.startswith(READ_BY_IMPORTS)}
+    return read | {"PYTHONPATH": ""}  # further folders are searched by what is imported from now on
+
+
+def paths(environment: dict[str, str]) -> list[str]:
+    return [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
 
 
 def main() -> None:
     from importlib import metadata
 
-    serve(sys.argv[1])
+    address = sys.argv[1]
+    serve(address)
+    sys.executable = str(Path(address).with_name("python"))
+    if sys.argv[0] == CODE:
+        exec(compile(sys.argv.pop(1), CODE, "exec"), {"__name__": "__main__"})
+        return
     (command,) = metadata.entry_points(group="console_scripts", name=sys.argv[0])
     sys.exit(command.load()())
 

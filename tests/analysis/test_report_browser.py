@@ -2,7 +2,7 @@
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 IMAGES = "[...document.images].filter(image => !(image.complete && image.naturalWidth > 0)).length"

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -42,7 +40,7 @@ env.close()
 
 def evaluate(root: Path, first: int) -> None:
     """Two training seeds' episodes from five starts, in a process that never renders."""
-    subprocess.run([sys.executable, "-c", EVALUATE, str(root), str(first)], check=True)
+    call("code", EVALUATE, str(root), str(first))
 
 
 def test_a_strangers_three_commands_and_a_rerun(tmp_path):

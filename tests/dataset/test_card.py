@@ -3,13 +3,13 @@
 import json
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from commands import call
 from PIL import Image
 from toy import ToyEnv
 
@@ -117,9 +117,7 @@ def test_the_modality_covers_every_channel_once(task, obs_type):
 
 @pytest.mark.slow
 def test_the_command_writes_a_card_with_its_pictures(copy, tmp_path):
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.card", f"--root={copy}", "--repo_id=alice/toy"]
-    done = subprocess.run([*command, f"--facts={tmp_path / 'facts.json'}"], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    call("constructskill-card", f"--root={copy}", "--repo_id=alice/toy", f"--facts={tmp_path / 'facts.json'}")
     card = (copy / "README.md").read_text()
     assert card.startswith("---\n") and "# alice/toy" in card
     assert card == render(json.loads((tmp_path / "facts.json").read_text()))

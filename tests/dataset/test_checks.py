@@ -9,6 +9,7 @@ import av
 import numpy as np
 import pandas as pd
 import pytest
+from commands import call
 
 from lerobot_constructskill.artifacts.digests import data_sha256
 from lerobot_constructskill.dataset.card import card_facts, render
@@ -345,23 +346,18 @@ def test_an_error_of_a_check_is_no_fault_of_the_data(error, pristine):
         complaints(open_dataset(pristine), broken)
 
 
-def check(*flags):
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.check", *flags]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
 @pytest.mark.slow
 def test_the_command_prints_a_line_for_each_check_and_tells_by_its_status(pristine, copy):
-    good = check(f"--root={pristine}")
     counted = f"9 demonstrations, 1108 frames: {len(CHECKS)} checks, nothing wrong."
-    assert good.returncode == 0 and counted in good.stdout
+    assert counted in call("constructskill-check", f"--root={pristine}")
     flip(copy / VIDEO)
-    bad = check(f"--root={copy}")
-    assert bad.returncode == 1 and f"FAIL  Files         {VIDEO} is not" in bad.stdout
-    assert "found something wrong" in bad.stderr and "Traceback" not in bad.stderr
+    said = call("constructskill-check", f"--root={copy}", fails=True)
+    assert f"FAIL  Files         {VIDEO} is not" in said
+    assert "found something wrong" in said and "Traceback" not in said
 
 
 @pytest.mark.parametrize("flags, words", [([], "--repo_id"), (["--root=/nowhere"], "no folder /nowhere")])
 def test_what_is_not_there_is_told_in_one_sentence(flags, words):
-    done = check(*flags)
+    command = [sys.executable, "-m", "lerobot_constructskill.scripts.check", *flags]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1

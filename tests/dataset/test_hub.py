@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hub_server import TOKENS, serve
@@ -47,7 +48,9 @@ def machine(hub, tmp_path_factory):
 
 def as_user(token, offline, function, *arguments, **options):
     from huggingface_hub import constants
+    from huggingface_hub.utils import _http
 
+    _http.time = SimpleNamespace(sleep=lambda seconds: None)  # it would wait longer and longer before it tries again
     os.environ.pop("HF_TOKEN", None)
     if token:
         os.environ["HF_TOKEN"] = token
@@ -123,8 +126,8 @@ def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine)
     assert file_hashes(machine(pull, "alice/cut")) == file_hashes(pristine)
 
 
-@pytest.mark.parametrize("update", [False, True])
-@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("update", [pytest.param(False, marks=pytest.mark.nightly), True])
+@pytest.mark.parametrize("after", [pytest.param(False, marks=pytest.mark.nightly), True])
 def test_a_push_killed_at_any_request_is_finished_by_the_same_command(update, after, hub, machine, tmp_path):
     def folder(name, content):
         for path in ("README.md", "meta/info.json", f"data/{content}.parquet"):

@@ -1,12 +1,9 @@
 """There and back on a Hub on loopback: push, train from the name, evaluate, push the policy, evaluate it by name."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from commands import call
 from hub_server import TOKENS, serve
 from toy import ToyEnv
 
@@ -15,7 +12,6 @@ from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 
 TOKEN = next(iter(TOKENS))
-BIN = Path(sys.executable).parent
 ENV = ["--env.type=constructskill", "--env.obs_type=pixels_agent_pos", "--env.episode_length=6"]
 EVAL = [*ENV, "--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu"]
 ACT = ["--policy.type=act", "--policy.dim_model=64", "--policy.n_heads=2", "--policy.dim_feedforward=64"]
@@ -38,25 +34,17 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
     root, evaluations = tmp_path / "set", tmp_path / "eval"
     record(GenerateConfig("local/toy", str(root), episodes=2, obs_type="pixels_agent_pos"))
     with serve() as hub:
-        surroundings = os.environ | {
-            "HF_ENDPOINT": hub.url,
-            "HF_HOME": str(tmp_path / "home"),
-            "HF_HUB_DISABLE_XET": "1",
-            "HF_TOKEN": TOKEN,
-            "CUDA_VISIBLE_DEVICES": "",
-        }
+        online = {"HF_ENDPOINT": hub.url, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1", "HF_TOKEN": TOKEN}
+        online["HF_HOME"] = str(tmp_path / "home")
 
-        def call(*command):
-            done = subprocess.run(list(map(str, command)), env=surroundings, capture_output=True, text=True)
-            assert done.returncode == 0, (done.stdout + done.stderr)[-3000:]
-            assert TOKEN not in done.stdout + done.stderr
+        def run(*command):
+            assert TOKEN not in call(*map(str, command), **online)
 
-        ours = [sys.executable, "-m"]
-        call(*ours, "lerobot_constructskill.scripts.push", "--repo_id=alice/set", f"--root={root}")
+        run("constructskill-push", "--repo_id=alice/set", f"--root={root}")
         source = ["--dataset.repo_id=alice/set", "--dataset.revision=v3.0"]
-        call(BIN / "lerobot-train", *ACT, *SMALL, *SHORT, *source, f"--output_dir={tmp_path / 'act'}")
+        run("lerobot-train", *ACT, *SMALL, *SHORT, *source, f"--output_dir={tmp_path / 'act'}")
         checkpoint = tmp_path / "act" / "checkpoints" / "000002" / "pretrained_model"
-        call(BIN / "lerobot-eval", f"--policy.path={checkpoint}", *EVAL, f"--output_dir={evaluations / 'seed_7'}")
+        run("lerobot-eval", f"--policy.path={checkpoint}", *EVAL, f"--output_dir={evaluations / 'seed_7'}")
         flags = [
             f"--policy_path={checkpoint}",
             f"--evaluations={evaluations}",
@@ -65,8 +53,8 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
         ]
         saved = json.loads((checkpoint / "config.json").read_text())
         (checkpoint / "config.json").write_text(json.dumps(saved | {"device": "cuda"}))  # trained on another machine
-        call(sys.executable, "-c", PUSH_POLICY, *flags)
-        call(BIN / "lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
+        run("code", PUSH_POLICY, *flags)
+        run("lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
         files = hub.repos["models/alice/act"].commits[hub.repos["models/alice/act"].branches["main"]]
         card = hub.blobs[files["README.md"][0]].decode()
         assert json.loads(hub.blobs[files["config.json"][0]])["device"] == "cuda", "and pushed from here"

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from disturbances import DISTURBANCES, recover
+from kinds import KINDS
 
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
@@ -188,7 +189,7 @@ def test_a_brick_held_where_the_arm_reaches_no_higher_still_comes_to_the_bin(tas
 
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", KINDS)
 def test_the_advice_is_followed_to_success_from_disturbed_states(task):
     env, expert = ConstructSkillEnv(task, render_backend="none"), make_expert(get_task(task), ExpertConfig())
     some = list(DISTURBANCES)[list(TASKS).index(task) % 3 :: 3]  # tasks share experts: each is tried with all

@@ -6,6 +6,7 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
+from kinds import KINDS
 
 from lerobot_constructskill.contract import DEMO_SEED_START, GRIPPER_OPEN, SIM_STATE, TASKS
 from lerobot_constructskill.demos.demonstrate import demonstrate
@@ -33,7 +34,7 @@ def state(**changes):
     return PrivilegedState(**{name: np.array(value, float) for name, value in (defaults | changes).items()})
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=KINDS)
 def env(request):
     env = ConstructSkillEnv(request.param, render_backend="none")
     yield env
@@ -174,7 +175,7 @@ def test_the_papers_demonstration_is_the_one_it_always_was():
 @pytest.mark.parametrize("name, frames", [("paper", 462), ("paper_noise_free", 430)])
 def test_the_papers_set_is_as_long_as_the_paper_says(name, frames):
     config = draccus.parse(GenerateConfig, CONFIGS / f"{name}.yaml", args=["--repo_id=local/paper"])
-    env = ConstructSkillEnv(config.task, config.obs_type, config.max_steps)
+    env = ConstructSkillEnv(config.task, config.obs_type, config.max_steps, render_backend="none")
     attempt, success = demonstrate(
         env, make_expert(TASKS[config.task], config.expert), config.noise, config.seed_start
     )
@@ -201,7 +202,7 @@ def test_a_demonstration_goes_on_to_the_experts_end_where_it_is_asked_to():
 @pytest.mark.sim
 def test_the_load_compensation_holds_the_brick_where_the_arm_alone_sags():
     """What `ExpertConfig.compliance` is for: a held brick sinks by centimetres a second where nothing is added."""
-    env = ConstructSkillEnv("brick_to_bin", episode_length=300)
+    env = ConstructSkillEnv("brick_to_bin", episode_length=300, render_backend="none")
     expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())
 
     def drift(upward):

@@ -148,10 +148,19 @@ def test_selections_that_no_policy_could_be_asked_are_refused(task, word):
         ConstructSkillEnvConfig(task=task)
 
 
-def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with():
-    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (200, 4)).astype(np.float32)
-    sent = np.array([ConstructSkillEnv().maniskill_action(action)[:3] for action in actions])
-    np.testing.assert_array_equal(sent, actions[:, :3] / np.float32(ACTION_SCALE))
+@pytest.mark.parametrize(
+    ("metres", "sent"),
+    [
+        ("0x1.64694cp-4", "0x1.bd839ep-1"),
+        ("-0x1.975b4cp-4", "-0x1.fd321ep-1"),
+        ("-0x1.4826ecp-5", "-0x1.9a30a6p-2"),
+        ("0x1.e24f82p-6", "0x1.2d71b0p-2"),
+    ],
+)
+def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with(metres, sent):
+    """Divided in float32. Multiplied by ten, or divided in float64, each has another last bit."""
+    action = np.array([0, float.fromhex(metres), 0, 1], np.float32)
+    assert ConstructSkillEnv().maniskill_action(action).tolist() == [0, float.fromhex(sent), 0, 0, 0, 0, 1]
 
 
 @pytest.mark.sim

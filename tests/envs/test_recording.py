@@ -1,12 +1,11 @@
 """What is recorded is what was executed: a recording, executed again, ends alike, whoever ran it."""
 
 import os
-import subprocess
-import sys
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from commands import call
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -80,7 +79,7 @@ vector.close()
 def test_lerobots_vector_environments_record(use_async_envs, tmp_path):
     """In a process of its own: a fork server that other tests have started does not hear of the variable."""
     code = STEP_TWO.format(use_async_envs=use_async_envs)
-    subprocess.run([sys.executable, "-c", code], env=os.environ | {FOLDER: str(tmp_path)}, check=True)
+    call("code", code, **{FOLDER: str(tmp_path)})
     recordings = [recording for path in sorted(tmp_path.iterdir()) for recording in read_recordings(path)]
     assert [(one.evaluation_seed, one.steps, len(one.flat)) for one in recordings] == [
         (seed, 2, 2 * len(get_task("block_to_bin").action_names)) for seed in (7, 8)

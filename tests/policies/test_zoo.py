@@ -22,10 +22,10 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES, chec
 
 TIMM = (
     "vit_tiny_patch16_224.augreg_in21k_ft_in1k",
-    pytest.param("vit_small_patch14_reg4_dinov2.lvd142m", marks=pytest.mark.slow),
     "resnet18.a1_in1k",
+    "vit_small_patch14_reg4_dinov2.lvd142m",
     "convnextv2_atto.fcmae_ft_in1k",
-    pytest.param("swin_tiny_patch4_window7_224.ms_in1k", marks=pytest.mark.slow),
+    "swin_tiny_patch4_window7_224.ms_in1k",
 )
 SMALL = {"num_hidden_layers": 1, "hidden_size": 48, "num_attention_heads": 3, "intermediate_size": 64}
 TRANSFORMERS = {
@@ -36,6 +36,11 @@ TRANSFORMERS = {
     "siglip": SiglipVisionConfig(**SMALL),
     "resnet": ResNetConfig(hidden_sizes=[8, 8, 16, 16], depths=[1, 1, 1, 1], embedding_size=8),
 }
+
+
+def some(models, quick=2):
+    """The first ones for `make test`, the others for `make nightly`."""
+    return [pytest.param(name, marks=pytest.mark.nightly if i >= quick else ()) for i, name in enumerate(models)]
 
 
 def describe(folder, config):
@@ -59,7 +64,7 @@ def check_it_encodes(name, folder, images, statistics):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", TIMM)
+@pytest.mark.parametrize("model", some(TIMM))
 def test_a_model_of_timm_encodes_as_its_configuration_says(model, tmp_path, images):
     import timm
 
@@ -69,7 +74,7 @@ def test_a_model_of_timm_encodes_as_its_configuration_says(model, tmp_path, imag
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", TRANSFORMERS)
+@pytest.mark.parametrize("kind", some(TRANSFORMERS))
 def test_a_model_of_transformers_encodes_as_its_folder_says(kind, tmp_path, images):
     describe(tmp_path, TRANSFORMERS[kind])
     spec = check_it_encodes("hf/somebody/model", tmp_path, images, ((0.4,) * 3, (0.2,) * 3))

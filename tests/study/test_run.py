@@ -11,6 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import yaml
+from commands import OFFLINE, call
 
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.artifacts.processor import processor
@@ -114,25 +115,37 @@ def study_file(tmp_path_factory, tiny_weights):
 
 
 @pytest.fixture(scope="module")
-def start(study_file, their_package):
-    """Start the study in a process of its own, with `<folder>/study` and `<folder>/store`."""
+def flags(study_file):
+    """The study's flags, with `<folder>/study` and `<folder>/store`."""
+    file = f"--config_path={study_file}"
+    return lambda folder: [file, f"--root={folder / 'study'}", f"--store={folder / 'store'}", "--workers=1"]
+
+
+@pytest.fixture(scope="module")
+def start(flags, their_package):
+    """Start the study in a true process, to be killed."""
 
     def begin(folder: Path, *options: str, **variables: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", "lerobot_constructskill.scripts.study", f"--config_path={study_file}"]
-        flags = [f"--root={folder / 'study'}", f"--store={folder / 'store'}", "--workers=1", *options]
+        command = [sys.executable, "-m", "lerobot_constructskill.scripts.study", *flags(folder), *options]
         path = os.pathsep.join(filter(None, [str(their_package), os.environ.get("PYTHONPATH")]))
-        # One thread, as on Ray: lerobot-train's sums depend on their number.
-        quiet = os.environ | {"HF_HUB_OFFLINE": "1", "PYTHONPATH": path, "OMP_NUM_THREADS": "1"} | variables
         log = (folder / "log").open("a")
-        return subprocess.Popen([*command, *flags], env=quiet, stdout=log, stderr=log, start_new_session=True)
+        quiet = os.environ | OFFLINE | {"PYTHONPATH": path} | variables
+        return subprocess.Popen(command, env=quiet, stdout=log, stderr=log, start_new_session=True)
 
     return begin
 
 
 @pytest.fixture(scope="module")
-def finish(start):
-    def until_the_end(folder: Path, *options: str, **variables: str) -> pd.DataFrame:
-        assert start(folder, *options, **variables).wait() == 0, (folder / "log").read_text()[-2000:]
+def run(flags, their_package):
+    """Run the study to its end; return what it said."""
+    path = {"PYTHONPATH": str(their_package)}
+    return lambda folder, *options, **how: call("constructskill-study", *flags(folder), *options, **path, **how)
+
+
+@pytest.fixture(scope="module")
+def finish(run):
+    def until_the_end(folder: Path, *options: str) -> pd.DataFrame:
+        run(folder, *options)
         return read_rows(folder / "study" / "rows.parquet")
 
     return until_the_end
@@ -153,6 +166,7 @@ def wait_for(process: subprocess.Popen, folder: Path, stage: str) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.nightly
 def test_killed_at_any_stage_it_ends_as_the_undisturbed_one(start, finish, undisturbed, tmp_path):
     for stage in STAGES:
         process = start(tmp_path)
@@ -200,7 +214,7 @@ def test_a_run_is_a_folder_with_all_that_belongs_to_it(undisturbed, folder):
         assert (own / "log.txt").exists() == failed and (not failed or "Traceback" in (own / "log.txt").read_text())
 
 
-def test_what_is_there_is_not_made_again_and_a_cut_study_is_put_together(start, finish, undisturbed, folder, tmp_path):
+def test_what_is_there_is_not_made_again_and_a_cut_study_is_put_together(run, finish, undisturbed, folder, tmp_path):
     def made() -> dict[Path, int]:
         return {path: path.stat().st_mtime_ns for path in (folder / "store" / "runs").glob("*/episodes.parquet")}
 
@@ -208,13 +222,12 @@ def test_what_is_there_is_not_made_again_and_a_cut_study_is_put_together(start, 
     (tmp_path / "store").symlink_to(folder / "store")
     pd.testing.assert_frame_equal(finish(tmp_path, "--only=fixed/tiny,fixed/no_op"), undisturbed)
     assert made() == before
-    assert start(tmp_path, "--status=true").wait() == 0
-    assert "fixed/absent: 0 finished, 2 failed, 0 missing" in (tmp_path / "log").read_text()
+    assert "fixed/absent: 0 finished, 2 failed, 0 missing" in run(tmp_path, "--status=true")
     with locked(tmp_path / "study" / ".lock"):
-        assert start(tmp_path).wait() == 1
-    assert (tmp_path / "log").read_text().strip().endswith("at this moment.")
+        assert run(tmp_path, fails=True).strip().endswith("at this moment.")
 
 
+@pytest.mark.nightly
 def test_on_a_cluster_it_ends_as_the_undisturbed_one_though_a_machine_dies(
     start, undisturbed, tmp_path, their_package, monkeypatch
 ):
