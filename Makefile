@@ -8,9 +8,10 @@ export PYTHONDONTWRITEBYTECODE :=
 PYTEST := OMP_NUM_THREADS=1 LP_NUM_THREADS=1 .venv/bin/pytest
 PARALLEL := $(PYTEST) -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder --durations=20
 
-# A file of nightly tests that has passed is not run again before something is edited, so a killed run goes on.
-PASSED = outputs/nightly/$(shell { git rev-parse HEAD; git diff HEAD; } | sha1sum | cut -c 1-12)
 NIGHTLY = $(shell grep -rlE --include='test_*.py' 'mark\.nightly|import KINDS' tests)
+CONTENT = $(shell git ls-files -zco --exclude-standard | xargs -0 sha1sum 2>/dev/null | sha1sum | cut -c 1-12)
+
+ENGINE ?= $(firstword $(foreach tool,docker podman buildah,$(shell command -v $(tool))))
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -30,16 +31,20 @@ check: setup ## lint, and the tests that need neither simulator nor training
 	.venv/bin/ruff format --check
 	$(PARALLEL) -q -m "not sim and not slow and not nightly"
 
-test: setup ## every test of what a change can break
+test: setup ## whatever a change is likely to break
 	$(PARALLEL) -m "not nightly"
 
-nightly: ## the tests that take longest, a file a core; the same command again goes on with what has not passed
+nightly: ## the longest tests; a file that passed is skipped until something changes, so a killed run goes on
 	@./setup.sh chromium
-	@$(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync $(NIGHTLY:%.py=$(PASSED)/%)
+	@$(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync PASSED=outputs/nightly/$(CONTENT) passed
+
+ifdef PASSED
+passed: $(NIGHTLY:%.py=$(PASSED)/%)
 
 $(PASSED)/%: %.py
 	@echo "== $<" && $(PYTEST) -q --durations=5 -m nightly $<
 	@mkdir -p $(@D) && touch $@
+endif
 
 mutants: setup ## sixty drawn edits of the package, each against the tests that reach it
 	.venv/bin/python tests/mutants.py
@@ -51,12 +56,12 @@ dist: setup ## the wheel and the source distribution, into dist/
 	.venv/bin/python -m build --no-isolation
 
 image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BASE=another Debian 13
-	$(firstword $(foreach tool,docker podman buildah,$(shell command -v $(tool)))) build -t constructskill \
+	$(ENGINE) build -t constructskill \
 		-f examples/vla_evaluation_harness/Dockerfile $(if $(BASE),--build-arg BASE=$(BASE)) .
 
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
-pins: setup ## resolve pyproject.toml afresh into constraints.txt, for x86-64 Linux and Python 3.12
+pins: ## resolve pyproject.toml afresh into constraints.txt, for x86-64 Linux and Python 3.12
 	PATH="$$PWD/.venv-uv/bin:$$PATH" uv pip compile pyproject.toml --quiet --upgrade --all-extras --python-version 3.12 \
 		--no-annotate --custom-compile-command="make pins" --output-file constraints.txt

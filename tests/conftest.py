@@ -68,7 +68,7 @@ def find_chromium() -> str | None:
 def browser():
     playwright, chromium = pytest.importorskip("playwright.sync_api"), find_chromium()
     if chromium is None:
-        pytest.skip("no Chromium here; `make test` installs it where apt has it")
+        pytest.skip("no Chromium here; `make nightly` installs it where apt has it")
     with playwright.sync_playwright() as started:
         browser = started.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         yield browser

@@ -1,8 +1,9 @@
 """Sixty edits of the package, drawn from mutmut's list by a fixed seed, each against the tests that reach it.
 
 `python tests/mutants.py` runs `make test` once, to see which test reaches which function, and then the mutants, one a
-core, each in a copy of the checkout; a killed run goes on. A mutant is caught where one of these tests fails; what all
-of them let pass is a survivor, to be shown equivalent or to be caught by a new test. --draw lists them and stops.
+core, each in a copy of the checkout. A mutant is caught where one of these tests fails or stands still. What all of
+them let pass has survived: it is to be shown equivalent, or to be caught by a new test. A killed run goes on while no
+file changes. --draw lists the mutants and stops.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
 from queue import Queue
@@ -27,10 +29,11 @@ from mutmut.mutation.file_mutation import Mutation, create_mutations
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "lerobot_constructskill"
 KEPT = ROOT / "outputs" / "mutants"
-REACH = KEPT / "reach.jsonl"
-LONGEST_S = 900
 MOST_TESTS = 400
 """Of those that reach a function, the quickest; a function that more of them reach is one that everything needs."""
+
+FAILED, NOT_COLLECTED = 1, 2
+"""Exit statuses of pytest that a mutant brings about."""
 
 
 @dataclass(frozen=True)
@@ -80,25 +83,28 @@ def draw(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
     rooms = groupby(sorted(mutants, key=lambda one: one.room), key=lambda one: one.room)
     drawn = [rng.choice(list(of)) for _, of in rooms]
     rest = [one for one in mutants if one not in drawn]
-    return drawn + rng.sample(rest, count - len(drawn))
+    return drawn + rng.sample(rest, max(0, count - len(drawn)))
+
+
+def own_files() -> list[str]:
+    """Every file that is, or would be, committed."""
+    listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    named = subprocess.check_output(listing, cwd=ROOT, text=True).split("\0")
+    return [name for name in sorted(named) if (ROOT / name).is_file()]
 
 
 def make_copy(folder: Path) -> Path:
     """A copy of the checkout whose environment is this one's, but for the package, which is the copy's own."""
     shutil.rmtree(folder, ignore_errors=True)
-    listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    for name in filter(None, subprocess.check_output(listing, cwd=ROOT, text=True).split("\0")):
-        if (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / name)
+    for name in own_files():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(ROOT / name, folder / name)
     python, site = Path(sys.executable), next(Path(sys.prefix).glob("lib/python*/site-packages"))
     own = folder / ".venv"
     subprocess.run([python, "-m", "venv", "--without-pip", own], check=True)
     inside = own / site.relative_to(sys.prefix)
     (inside / "copy.pth").write_text(f"{folder}\n{folder / 'tests'}\n{site}\n")
-    (inside / "sitecustomize.py").write_text(
-        "import os\nif os.environ.get('REACH'):\n    import reach  # noqa: F401\n"
-    )
+    (inside / "sitecustomize.py").write_text("import os\nif os.environ.get('REACH'):\n    import reach\n")
     for script in python.parent.iterdir():
         if script.is_file() and script.read_bytes().startswith(b"#!" + str(python.parent).encode()):
             (own / "bin" / script.name).write_text(script.read_text().replace(str(python.parent), str(own / "bin")))
@@ -107,56 +113,66 @@ def make_copy(folder: Path) -> Path:
     return folder
 
 
-def run_pytest(
-    copy: Path, *options: str, timeout: float | None = None, **surroundings: str
-) -> subprocess.CompletedProcess[str]:
+def run_pytest(copy: Path, *options: str, timeout: float | None = None, **surroundings: str) -> tuple[int, str]:
     quiet = os.environ | {"OMP_NUM_THREADS": "1", "LP_NUM_THREADS": "1"} | surroundings
     quiet.pop("PYTHONDONTWRITEBYTECODE", None)
     command = [copy / ".venv" / "bin" / "python", "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
-    return subprocess.run(command, cwd=copy, env=quiet, capture_output=True, text=True, timeout=timeout)
+    done = subprocess.run(command, cwd=copy, env=quiet, capture_output=True, text=True, timeout=timeout)
+    return done.returncode, done.stdout
 
 
-def reaching() -> dict[tuple[str, str], list[str]]:
-    """(module, name of a function) to the tests that reach it, the quickest first."""
-    if not REACH.exists():
-        copy = make_copy(KEPT / "whole")
-        options = ["-p", "reach", "-m", "not nightly", "-n", "auto", "--maxprocesses=4", "--dist=loadfile"]
-        done = run_pytest(copy, *options, "--no-loadscope-reorder", REACH=str(REACH.with_suffix(".new")))
-        print(done.stdout[-3000:], flush=True)
-        REACH.with_suffix(".new").rename(REACH)
-    times, not_passed = defaultdict(float), set()
-    for line in (KEPT / "reach.new.times").read_text().splitlines():
-        test, _, outcome, seconds = json.loads(line)
-        times[test] += seconds
-        if outcome != "passed":
-            not_passed.add(test)
-    passed, tests_of, found = times.keys() - not_passed, defaultdict(set), defaultdict(set)
-    for test in passed:
-        tests_of[test.partition("::")[0]].add(test)
-    for line in REACH.read_text().splitlines():
-        test, phase, module, qualified = json.loads(line)
-        names = {part for part in qualified.split(".") if not part.startswith("<")}
-        same = tests_of[test.partition("::")[0]] if phase == "setup" else {test} & passed  # a fixture is of its file
-        for name in names:
-            found[module, name] |= same
-    return {key: sorted(tests, key=times.__getitem__) for key, tests in found.items()}
+class Reach:
+    """Which tests reach which function, and how long each takes."""
+
+    def __init__(self, folder: Path):
+        reach, times = folder / "reach.jsonl", folder / "reach.jsonl.times"
+        if not (folder / "whole").exists():
+            reach.unlink(missing_ok=True)
+            times.unlink(missing_ok=True)
+            copy = make_copy(folder / "unfinished")
+            options = ["-p", "reach", "-m", "not nightly", "-n", "auto", "--maxprocesses=4", "--dist=loadfile"]
+            status, said = run_pytest(copy, *options, "--no-loadscope-reorder", REACH=str(reach))
+            print(said[-1000:], flush=True)
+            assert status == 0, "mutants say something only where all tests pass without one"
+            copy.rename(folder / "whole")
+        self.seconds, not_passed, tests_of = defaultdict(float), set(), defaultdict(set)
+        for line in times.read_text().splitlines():
+            test, _, outcome, seconds = json.loads(line)
+            self.seconds[test] += seconds
+            if outcome != "passed":
+                not_passed.add(test)
+        passed = self.seconds.keys() - not_passed
+        for test in passed:
+            tests_of[test.partition("::")[0]].add(test)
+        self._found = defaultdict(set)
+        for line in reach.read_text().splitlines():
+            test, phase, module, qualified = json.loads(line)
+            reached = tests_of[test.partition("::")[0]] if phase == "setup" else {test} & passed
+            for name in {part for part in qualified.split(".") if not part.startswith("<")}:
+                self._found[module, name] |= reached
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Those that reach its function, the quickest first."""
+        found = self._found.get((mutant.module, mutant.function), ())
+        return sorted(found, key=self.seconds.__getitem__)[:MOST_TESTS]
 
 
-def try_mutant(mutant: Mutant, tests: list[str], copy: Path) -> dict:
+def try_mutant(mutant: Mutant, tests: list[str], timeout: float, copy: Path) -> dict:
     """Run the tests on the mutant until one fails, and say which; the copy is as before in the end."""
     path = copy / "lerobot_constructskill" / mutant.module
     path.write_text(mutant.source)
-    by = f"survived {len(tests)} tests"
+    by = None
     try:
-        done = run_pytest(copy, "-x", *tests, timeout=LONGEST_S) if tests else None
-        if done and done.returncode:
-            ended = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-            by = (ended or [f"pytest ended with {done.returncode}"])[0].partition(" - ")[0]
+        status, said = run_pytest(copy, "-x", *tests, timeout=timeout) if tests else (0, "")
+        if status in (FAILED, NOT_COLLECTED):
+            by = next(line for line in said.splitlines() if line.startswith(("FAILED", "ERROR"))).partition(" - ")[0]
+        elif status:
+            raise RuntimeError(f"{mutant.name}: pytest ended with {status}: {said[-1000:]}")
     except subprocess.TimeoutExpired:
-        by = f"stood still for {LONGEST_S} s"
+        by = f"stood still for {timeout:.0f} s"
     finally:
         path.write_text(mutant.tree.code)
-    return {"mutant": mutant.name, "function": mutant.function, "caught": not by.startswith("survived"), "by": by}
+    return {"mutant": mutant.name, "function": mutant.function, "tests": len(tests), "caught_by": by}
 
 
 def main() -> None:
@@ -168,33 +184,36 @@ def main() -> None:
     everything = list_mutants()
     drawn = draw(everything, asked.count, asked.seed)
     print(f"{len(drawn)} of {len(everything)} mutants, seed {asked.seed}", flush=True)
-    for mutant in drawn if asked.draw else ():
-        print(mutant.name, mutant.function, *mutant.diff, sep="\n    ")
     if asked.draw:
+        for mutant in drawn:
+            print(mutant.name, mutant.function, *mutant.diff, sep="\n    ")
         return
-    KEPT.mkdir(parents=True, exist_ok=True)
-    outcomes, tests = KEPT / f"outcomes_{asked.seed}.jsonl", reaching()
+    content = sha256(b"".join((ROOT / name).read_bytes() for name in own_files())).hexdigest()[:12]
+    folder = KEPT / content
+    folder.mkdir(parents=True, exist_ok=True)
+    reach, outcomes = Reach(folder), folder / f"outcomes_{asked.seed}.jsonl"
     before = [json.loads(line) for line in outcomes.read_text().splitlines()] if outcomes.exists() else []
     done = {one["mutant"] for one in before}
-    cores = len(os.sched_getaffinity(0))
     copies: Queue[Path] = Queue()
+    cores = len(os.sched_getaffinity(0))
     for number in range(cores):
-        copies.put(make_copy(KEPT / f"copy_{number}"))
+        copies.put(make_copy(folder / f"copy_{number}"))
 
     def run(mutant: Mutant) -> None:
-        copy = copies.get()
+        copy, tests = copies.get(), reach.tests(mutant)
         try:
-            found = try_mutant(mutant, tests.get((mutant.module, mutant.function), [])[:MOST_TESTS], copy)
+            found = try_mutant(mutant, tests, 60 + 4 * sum(map(reach.seconds.__getitem__, tests)), copy)
         finally:
             copies.put(copy)
         with outcomes.open("a") as file:
             file.write(json.dumps(found) + "\n")
-        print(f"{'caught' if found['caught'] else 'SURVIVED':<8}  {mutant.name}  {found['by']}", flush=True)
+        told = f"caught    {found['caught_by']}" if found["caught_by"] else f"SURVIVED  {len(tests)} tests"
+        print(f"{mutant.name:<45} {told}", flush=True)
 
     with ThreadPoolExecutor(cores) as pool:
         list(pool.map(run, [one for one in drawn if one.name not in done]))
     told = [json.loads(line) for line in outcomes.read_text().splitlines()]
-    print(f"{sum(one['caught'] for one in told)} of {len(told)} caught")
+    print(f"{sum(one['caught_by'] is not None for one in told)} of {len(told)} caught")
 
 
 if __name__ == "__main__":

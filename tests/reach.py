@@ -1,7 +1,7 @@
 """A plugin of pytest that writes down which function of the package is reached by which test, for mutants.py.
 
-Python's own monitoring tells of a function once for each test and process, so the tests take as long as without. Every
-process that Python starts imports this module where `$REACH` names a file: what a test's processes reach, it reaches.
+Python's own monitoring tells of a function once for each test and process, so the tests take as long as without. Where
+`$REACH` names a file, every Python process imports this module: what the processes of a test reach is reached by it.
 """
 
 import json
@@ -31,6 +31,12 @@ if FILE and sys.monitoring.get_tool(TOOL) is None:
     sys.monitoring.register_callback(TOOL, sys.monitoring.events.PY_START, _seen)
     sys.monitoring.set_events(TOOL, sys.monitoring.events.PY_START)
     os.register_at_fork(after_in_child=sys.monitoring.restart_events)
+
+
+def pytest_collectstart(collector) -> None:
+    """What a test file calls while it is imported, for its parameters for instance, is reached by all of its tests."""
+    os.environ["PYTEST_CURRENT_TEST"] = f"{collector.nodeid} (setup)"
+    sys.monitoring.restart_events()
 
 
 def pytest_runtest_setup(item) -> None:

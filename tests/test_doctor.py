@@ -1,5 +1,6 @@
 """The doctor's judgements on made-up machines."""
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,16 @@ def test_complaints_name_their_cause() -> None:
     assert "0.7.0 was not tried" in checks.judge_lerobot("0.7.0").message
     assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb\t", "")).message
+
+
+def test_a_check_has_one_name_whatever_it_finds() -> None:
+    functions = [
+        node for node in ast.parse(Path(checks.__file__).read_text()).body if isinstance(node, ast.FunctionDef)
+    ]
+    for function in functions:
+        calls = [node for node in ast.walk(function) if isinstance(node, ast.Call)]
+        found = [call.args for call in calls if ast.unparse(call.func) == "Finding"]
+        assert len({ast.unparse(name) for _, name, _ in found}) <= 1, function.name
 
 
 def test_the_pinned_lerobot_was_tried_and_so_says_the_page() -> None:

@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from commands import call_inside
 
 from lerobot_constructskill import parsing
 from lerobot_constructskill.errors import (
@@ -36,8 +37,8 @@ Run = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Run:
-    """Call a command in this process; return its exit status and what it printed for the user."""
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Call a command in this process, with an error in its first piece of work; return its status and what it said."""
 
     def call(command: str, *flags: str, error: BaseException | None = None, state: Path = tmp_path) -> tuple[int, str]:
         def broken(*arguments: object, **options: object) -> None:
@@ -47,19 +48,14 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
         name, function = SCRIPTS[command].split(":")
         module = import_module(name)
         with monkeypatch.context() as patch:
-            patch.setattr(sys, "argv", [command, *flags])
             patch.setattr(tempfile, "tempdir", str(tmp_path))
-            for variable, value in {"XDG_STATE_HOME": str(state), "OMP_WAIT_POLICY": "PASSIVE"}.items():
-                patch.setenv(variable, value)
+            patch.setenv("XDG_STATE_HOME", str(state))
             if error is not None:
                 patch.setattr(parsing, "parse", broken)
                 for first in {"diagnose", "show"} & vars(module).keys():  # they have no configuration to parse
                     patch.setattr(module, first, broken)
-            try:
-                status = getattr(module, function)() or 0
-            except SystemExit as exit:
-                status = exit.code
-        return status, capsys.readouterr().err
+            status, _, said = call_inside(getattr(module, function), command, *flags)
+        return status, said
 
     return call
 

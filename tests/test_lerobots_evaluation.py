@@ -39,6 +39,11 @@ def hub():
         yield hub
 
 
+def recordings(folder, word):
+    roots = [folder / word / "recordings" / "constructskill_0" / f"env_{i}" for i in range(2)]
+    return [LeRobotDataset(f"alice/async_{word}_constructskill_0_{root.name}", root=root) for root in roots]
+
+
 def test_asynchronous_and_synchronous_evaluations_record_the_same_episodes(hub, tmp_path):
     """Two episodes at once, recorded into a folder and to the Hub."""
     where = {"HF_ENDPOINT": hub.url, "HF_TOKEN": next(iter(TOKENS)), "HF_HOME": str(tmp_path / "home")}
@@ -47,14 +52,7 @@ def test_asynchronous_and_synchronous_evaluations_record_the_same_episodes(hub, 
     flags = [*POLICY, *ENV, *two, *to, "--eval.use_async_envs={0}", f"--output_dir={tmp_path}/{{0}}"]
     online = {"HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1"}
     call(sys.executable, "-c", EVALUATE_TWICE, *flags, **online, **where)
-    recorded = [
-        [
-            LeRobotDataset(f"alice/async_{word}_constructskill_0_env_{i}", root=folder / f"env_{i}")
-            for i in range(2)
-            for folder in [tmp_path / word / "recordings" / "constructskill_0"]
-        ]
-        for word in ("true", "false")
-    ]
+    recorded = [recordings(tmp_path, word) for word in ("true", "false")]
     for of_async, of_sync in zip(*recorded, strict=True):
         columns = [dataset.hf_dataset.with_format("numpy") for dataset in (of_async, of_sync)]
         for name in ("action", "agent_pos", "next.reward", "next.success", "timestamp"):

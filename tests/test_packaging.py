@@ -9,11 +9,11 @@ import tarfile
 import tomllib
 import zipfile
 from collections.abc import Callable
-from contextlib import suppress
 from importlib import import_module, metadata
 from pathlib import Path
 
 import pytest
+from commands import call_inside
 
 from lerobot_constructskill import presets
 from lerobot_constructskill.errors import MissingError
@@ -82,8 +82,11 @@ for command, target in {scripts}.items():
     module, function = target.split(":")
     os.environ.pop("OMP_WAIT_POLICY", None)
     sys.argv = [command, "--help"]
-    with contextlib.redirect_stdout(io.StringIO()) as help, contextlib.suppress(SystemExit):
-        getattr(importlib.import_module(module), function)()
+    with contextlib.redirect_stdout(io.StringIO()) as help:
+        try:
+            getattr(importlib.import_module(module), function)()
+        except SystemExit as exit:
+            assert not exit.code, f"{{command}} --help ends with {{exit.code}}"
     assert f"usage: {{command}}" in help.getvalue(), f"{{command}} --help prints no help"
     assert "torch" not in sys.modules, f"{{command}} --help imports torch"
     assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE", f"the threads of {{command}} will spin"
@@ -94,26 +97,17 @@ def test_help_does_not_wait_for_torch() -> None:
     run_python(HELP.format(scripts=PROJECT["scripts"]))
 
 
-@pytest.fixture
-def front(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[str, str]]:
-    """Call `constructskill` in this process; return what it printed and what it said of an error."""
+def test_one_command_lists_the_others_and_starts_them() -> None:
+    def front(*arguments: str) -> tuple[int, str, str]:
+        return call_inside(main, "constructskill", *arguments)
 
-    def call(*arguments: str) -> tuple[str, str]:
-        monkeypatch.setattr(sys, "argv", ["constructskill", *arguments])
-        with suppress(SystemExit):
-            main()
-        return capsys.readouterr()
-
-    return call
-
-
-def test_one_command_lists_the_others_and_starts_them(front: Callable[..., tuple[str, str]]) -> None:
-    listed, _ = front()
+    _, listed, _ = front()
     assert all(f"\n  {name.removeprefix('constructskill-')} " in listed for name in PROJECT["scripts"] if "-" in name)
-    assert front("--version")[0].startswith(f"constructskill {PROJECT['version']} (Python ")
-    assert front("config", "study/paper")[0] == f"{show('study/paper')}\n"
-    assert front("generate", "fsat")[1].startswith("constructskill-generate: There is no file and no")
-    assert "'genrate'; the commands are: board, " in front("genrate")[1]
+    assert front("--version")[1].startswith(f"constructskill {PROJECT['version']} (Python ")
+    assert front("config", "study/paper") == (0, f"{show('study/paper')}\n", "")
+    assert front("generate", "fsat")[2].startswith("constructskill-generate: There is no file and no")
+    status, _, unknown = front("genrate")
+    assert status == 1 and "'genrate'; the commands are: board, " in unknown
 
 
 @pytest.fixture(scope="module")
@@ -174,24 +168,16 @@ def test_a_name_that_is_none_is_answered_with_those_there_are(name: str) -> None
 
 
 @pytest.fixture
-def generate(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[str, str]]:
+def generate(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
     """Call a command in this process that prints some fields and makes nothing."""
     command = import_module("lerobot_constructskill.scripts.generate")
-    told = lambda config: f"{config.task} {config.episodes} {config.repo_id}"  # noqa: E731
-
-    def call(*arguments: str) -> tuple[str, str]:
-        monkeypatch.setattr(command, "generate", told)
-        monkeypatch.setattr(sys, "argv", ["constructskill-generate", *arguments])
-        with suppress(SystemExit):
-            command.main()
-        return capsys.readouterr()
-
-    return call
+    monkeypatch.setattr(command, "generate", lambda config: f"{config.task} {config.episodes} {config.repo_id}")
+    return lambda *arguments: call_inside(command.main, "constructskill-generate", *arguments)
 
 
-@pytest.mark.parametrize("name", ["smoke", f"{SMOKE}", f"--config_path={SMOKE}"])
-def test_a_command_takes_a_name_a_file_or_a_flag(name: str, generate: Callable[..., tuple[str, str]]) -> None:
-    assert generate(name, "--repo_id=a/b") == ("brick_to_bin 2 a/b\n", "")
+@pytest.mark.parametrize("named", ["smoke", f"{SMOKE}", f"--config_path={SMOKE}"], ids=["name", "file", "flag"])
+def test_a_command_takes_a_name_a_file_or_a_flag(named: str, generate: Callable[..., tuple[int, str, str]]) -> None:
+    assert generate(named, "--repo_id=a/b") == (0, "brick_to_bin 2 a/b\n", "")
 
 
 @pytest.mark.parametrize(
@@ -199,10 +185,10 @@ def test_a_command_takes_a_name_a_file_or_a_flag(name: str, generate: Callable[.
     [(["fsat"], "'fsat'; the configurations are: direct, "), (["fast", "--config_path=x"], "give only one")],
 )
 def test_a_command_tells_what_is_wrong_with_a_name(
-    arguments: list[str], said: str, generate: Callable[..., tuple[str, str]]
+    arguments: list[str], said: str, generate: Callable[..., tuple[int, str, str]]
 ) -> None:
-    printed, told = generate(*arguments)
-    assert not printed and said in told and len(told.splitlines()) == 1
+    status, printed, told = generate(*arguments)
+    assert status == 1 and not printed and said in told and len(told.splitlines()) == 1
 
 
 def own_files() -> list[str]:

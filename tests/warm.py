@@ -2,8 +2,8 @@
 
 `python warm.py <socket>` is that process. A command is a wrapper in a folder of its own (`write_wrappers`), to be
 started like the true one: it hands its arguments, environment, folder and streams to the process, and ends as the fork
-does. Where a variable differs that is read while modules are imported, it becomes the true command instead. What a
-command starts by its place beside `sys.executable`, as a study does `lerobot-train`, starts warm as well.
+does. Where a variable differs that is read while modules are imported, it becomes the true command instead. Commands
+that are found beside `sys.executable`, as a study finds `lerobot-train`, start warm too.
 """
 
 import gc
@@ -39,7 +39,7 @@ with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as warm:
     socket.send_fds(warm, [request], [0, 1, 2])
     answer = warm.recv(100).decode()
 if answer == "cold":
-    os.execv("{true}", ["{true}", *sys.argv[1:]])
+    os.execv("{true[0]}", {true} + sys.argv[1:])
 sys.exit(int(answer or 1))
 """
 
@@ -49,7 +49,8 @@ def write_wrappers(names: Sequence[str], folder: Path, address: Path, true: Path
     (folder / "python").write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
     (folder / "python").chmod(0o755)
     for name in names:
-        said = WRAPPER.format(python=sys.executable, address=address, name=name, true=true / name)
+        command = [sys.executable, "-c"] if name == CODE else [str(true / name)]
+        said = WRAPPER.format(python=sys.executable, address=address, name=name, true=command)
         (folder / name).write_text(said)
         (folder / name).chmod(0o755)
 

@@ -14,6 +14,11 @@ RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/study.yaml")
 LARGEST = 5_000_000
 
 
+def one_and_nightly_the_others() -> list:
+    first, *others = RESULTS
+    return [first, *(pytest.param(folder, marks=pytest.mark.nightly) for folder in others)]
+
+
 def load(path: Path) -> dict:
     return tags.read(path)
 
@@ -51,8 +56,8 @@ def test_a_published_study_is_one_of_configs_with_as_many_seeds_or_fewer(folder)
         assert study["variants"][name]["seeds"] <= fields.get("seeds", 10)
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", one_and_nightly_the_others(), ids=lambda folder: folder.name)
 def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     """Its Markdown, that is: the figures are not drawn, which takes most of a report's time."""
     monkeypatch.setattr(ink, "encoded", lambda drawing, paper, *formats: [b""] * len(formats))

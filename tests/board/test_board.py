@@ -82,6 +82,7 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
         tasks = [f"{entry.said.suite}_{one}" for one in entry.standings] if official else []
         results = yaml.safe_load(path.read_text()) if path.exists() else []
         assert [one["dataset"]["task_id"] for one in results] == tasks
+        assert all(list(one) == ["dataset", "value", "notes"] for one in results), "in the order of the Hub's page"
         assert official == any(one["model"] == entry.name for one in others["results"])
     for page in pages.values():
         links = {link for link in page.found["href"] if not link.startswith(("#", "data:"))}

@@ -57,13 +57,13 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
     said = call("constructskill-verify", f"--root={entry}", **recorded)
     assert "10 of 10 episodes replayed (30 steps)" in said
     assert {path: path.read_bytes() for path in tmp_path.rglob("recorded/*/*")} == before
-    said = call("constructskill-verify", f"--root={entry}", "--value=beef")
+    said = call("constructskill-verify", f"--root={entry}", "--value=beef", "--workers=1")
     first = int(said.partition("fresh starts are ")[2].split()[0])
     assert first >= FIRST_FRESH and f"--seed={first}" in said and f"first_start: {first}" in said
     evaluate(tmp_path / "fresh", first)
     (tmp_path / "settings.yaml").write_text(yaml.safe_dump({"shifted": SETTINGS["shifted"] | {"first_start": first}}))
     call("constructskill-submit", *flags, f"--recorded={tmp_path / 'fresh'}", f"--root={again}")
-    rerun = ["--value=beef", f"--rerun={again}", f"--record={tmp_path / 'verified'}"]
+    rerun = ["--value=beef", f"--rerun={again}", f"--record={tmp_path / 'verified'}", "--workers=1"]
     said = call("constructskill-verify", f"--root={entry}", *rerun)
     assert "10 of 10 episodes replayed (30 steps)" in said and "shifted 0% submitted, 0% run anew" in said
     path = tmp_path / "verified" / "entry.json"
@@ -107,6 +107,6 @@ def test_a_difference_on_another_make_of_processor_is_told_as_such(tmp_path):
     for name, is_told in ((make(), False), ("AnotherMake", True)):
         versions = declared["versions"] | {"processor": name}
         write_submission(tmp_path / name, claims, **declared | {"versions": versions})
-        told = call("constructskill-verify", f"--root={tmp_path / name}", fails=True)
+        told = call("constructskill-verify", f"--root={tmp_path / name}", "--workers=1", fails=True)
         assert "1 of 10 replayed episodes are not as claimed" in told and "lifted is False, not True" in told
         assert ("processor 'AnotherMake' there" in told) == ("verify it on the make" in told) == is_told

@@ -240,6 +240,15 @@ def test_the_replay_command_says_how_many_ended_as_recorded(demonstrations):
     assert said.startswith("PREGRASP") and "1 demonstration ended as recorded" in said
 
 
+@pytest.mark.nightly
+def test_ray_makes_the_same_bytes(demonstrations, tmp_path):
+    pytest.importorskip("ray", reason="the extra `distributed` brings it")
+    run = generate(tmp_path / "set", "--episodes=3", "--obs_type=pixels_agent_pos", "--workers=2", "--executor=ray")
+    _, stderr = run.communicate()
+    assert run.returncode == 0, stderr
+    assert hashes(tmp_path / "set") == hashes(demonstrations)
+
+
 def hashes(root):
     """Of the data set; the card that the command writes beside it is another test's."""
     files = [path for folder in ("data", "videos", "meta") for path in (root / folder).rglob("*") if path.is_file()]

@@ -159,8 +159,9 @@ def test_selections_that_no_policy_could_be_asked_are_refused(task, word):
 )
 def test_metres_become_maniskills_numbers_with_the_rounding_that_recorded_data_sets_replay_with(metres, sent):
     """Divided in float32. Multiplied by ten, or divided in float64, each has another last bit."""
-    action = np.array([0, float.fromhex(metres), 0, 1], np.float32)
-    assert ConstructSkillEnv().maniskill_action(action).tolist() == [0, float.fromhex(sent), 0, 0, 0, 0, 1]
+    one, other = (float.fromhex(number) for number in (metres, sent))
+    action = np.array([one, -one, one, 1], np.float32)
+    assert ConstructSkillEnv().maniskill_action(action).tolist() == [other, -other, other, 0, 0, 0, 1]
 
 
 @pytest.mark.sim

@@ -107,6 +107,14 @@ def test_a_gripper_that_never_moves_gets_half_of_the_changes():
     assert (metrics.gripper_accuracy, metrics.gripper_change_accuracy) == (0.5, 0.5)
 
 
+def test_a_gripper_that_is_a_step_late_is_wrong_in_the_frame_after_each_change_and_right_before_it():
+    labels = demonstration()
+    late = labels.copy()
+    late[1:, -1] = labels[:-1, -1]
+    metrics = offline_metrics([Predictions(labels, late[:, None])])
+    assert (metrics.gripper_accuracy, metrics.gripper_change_accuracy) == (0.95, 0.5)
+
+
 def test_chunks_that_drift_disagree_by_their_drift_and_beyond_the_end_nothing_counts():
     labels = demonstration()
     drift = np.arange(CHUNK)[:, None] * SHIFT
