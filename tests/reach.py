@@ -4,6 +4,7 @@ Python's own monitoring tells of a function once for each test and process, so t
 `$REACH` names a file, every Python process imports this module: what the processes of a test reach is reached by it.
 """
 
+import atexit
 import json
 import os
 import sys
@@ -31,6 +32,7 @@ if FILE and sys.monitoring.get_tool(TOOL) is None:
     sys.monitoring.register_callback(TOOL, sys.monitoring.events.PY_START, _seen)
     sys.monitoring.set_events(TOOL, sys.monitoring.events.PY_START)
     os.register_at_fork(after_in_child=sys.monitoring.restart_events)
+    atexit.register(sys.monitoring.set_events, TOOL, 0)
 
 
 def pytest_collectstart(collector) -> None:

@@ -24,7 +24,7 @@ from synthetic_study import (
 from lerobot_constructskill.analysis.report import ink
 from lerobot_constructskill.analysis.report.answer import answer, status
 from lerobot_constructskill.analysis.report.collect import collect
-from lerobot_constructskill.analysis.report.figures import grid_figure
+from lerobot_constructskill.analysis.report.figures import _seeds_axis, grid_figure
 from lerobot_constructskill.analysis.report.page import read_study
 from lerobot_constructskill.analysis.report.wording import p_value, roman, seed_spans, signed
 from lerobot_constructskill.analysis.stats.comparisons import Verdict
@@ -126,6 +126,16 @@ def test_a_run_that_was_not_made_is_neither_a_failure_nor_a_zero(tmp_path):
     assert [(pair.counts_a, pair.counts_b) for pair in setting.comparisons["placed"]] == [((2, 2), (1, 1))]
     assert setting.failures == [] and findings.repeated == (3, 3)
     assert status(findings) == "1 of 4 runs is missing: every number below is provisional."
+
+
+@pytest.mark.parametrize(
+    ("failed", "said"), [(1, "1 run failed and counts as a seed"), (2, "2 runs failed and count as seeds")]
+)
+def test_failed_runs_are_counted_in_a_sentence(failed, said, tmp_path):
+    lost = list(planned(SMALL))[::2][:failed]  # a seed of each variant
+    rows = [failed_row(SMALL, run, "It fell.") for run in lost]
+    rows += [row for run in planned(SMALL) if run not in lost for row in episode_rows(SMALL, run, 2, 2)]
+    assert status(findings_of(SMALL, rows, tmp_path)).startswith(f"{said} that met no criterion.")
 
 
 def test_a_reference_that_was_not_made_is_missing(tmp_path):
@@ -384,6 +394,16 @@ def test_a_folder_that_is_no_studys_is_refused_in_a_sentence(name, tmp_path):
     (root / name).unlink()
     with pytest.raises(MissingError, match=f"'{root}' is not the folder of a study: {name} is missing."):
         report(ReportConfig(root))
+
+
+def test_an_axis_of_seeds_ends_within_a_tenth_of_its_outer_marks():
+    from matplotlib.figure import Figure
+
+    axis = Figure().subplots()
+    _seeds_axis(axis, "title", "label")
+    (low, high), marks = axis.get_xlim(), axis.get_xticks()
+    assert 1 < marks[0] / low < 1.1 and 1 < high / marks[-1] < 1.1
+    assert (axis.get_title(), axis.get_xlabel()) == ("title", "label")
 
 
 def test_numbers_as_they_are_written():

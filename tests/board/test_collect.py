@@ -1,6 +1,8 @@
 """From recordings to a submission: what is missing or was recorded twice is refused, what failed stays counted."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from lerobot_constructskill.board.protocol import Setting
 from lerobot_constructskill.board.submission import About
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.scripts.submit import SubmitConfig
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
 
 CONTROL = Setting("block_to_bin", episodes=2, episode_length=2, first_start=7)
@@ -180,3 +183,22 @@ def test_what_a_study_does_not_have_is_said(study, tmp_path):
     (study / STUDY).unlink()
     with pytest.raises(MissingError, match="study.yaml is missing"):
         collected(row)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({}, "Give what the submission is made from: --recorded, or --study with --variant."),
+        ({"recorded": Path("r"), "study": Path("s"), "variant": "ours"}, "Give what the submission is made from"),
+        ({"study": Path("s")}, "--study with --variant"),
+        ({"recorded": Path("r"), "study_settings": ["block"]}, "study_settings are of --study."),
+        (
+            {"recorded": Path("r"), "failures": {"-1": "lost"}},
+            "failures must map training seeds to reasons, not '-1'.",
+        ),
+    ],
+    ids=str,
+)
+def test_a_submission_of_what_does_not_belong_together_is_refused(fields, said):
+    with pytest.raises(InputError, match=re.escape(said)):
+        SubmitConfig("bins", Path("about.yaml"), Path("entry"), **fields)

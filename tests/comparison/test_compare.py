@@ -76,6 +76,12 @@ def test_two_spellings_of_a_perturbation_are_one(study, recorded):
     assert compared(published, recorded(GOOD, perturb="light=2,camera=1")).judgement.verdict is Verdict.INCONCLUSIVE
 
 
+def test_another_draw_of_a_perturbation_is_another_condition(study, recorded):
+    published = study(GOOD, env=ENV | {"perturb": "camera=1"})
+    with pytest.raises(InputError, match=r"perturbation \(\+camera=1\+seed=0, \+camera=1\+seed=3\)"):
+        compared(published, recorded(GOOD, perturb="camera=1", perturb_seed=3))
+
+
 def test_starts_are_those_in_common(study):
     whole, later = study(GOOD), study(GOOD, "later", starts=range(1008, 1018))
     comparison = compared(whole, later)

@@ -22,6 +22,19 @@ def test_what_lerobot_keeps_of_episodes_is_what_it_is_given(pristine):
     assert ours.features == theirs.features and ours[:] == theirs[:]
 
 
+def test_statistics_are_of_one_column_after_another(pristine, monkeypatch):
+    """All of them at once would not fit: a long set's columns are gigabytes."""
+    read, asked = merge.pd.read_parquet, []
+
+    def note(path, columns):
+        asked.append(columns)
+        return read(path, columns=columns)
+
+    monkeypatch.setattr(merge.pd, "read_parquet", note)
+    statistics = merge.frame_statistics(pristine)
+    assert asked == [[name] for name in statistics]
+
+
 @pytest.mark.slow
 def test_a_set_is_the_same_file_for_file_as_lerobot_merges_it(pristine, tmp_path, lerobots_way):
     record_toy(tmp_path / "plain", episodes=9)

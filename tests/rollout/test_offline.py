@@ -22,6 +22,7 @@ from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.offline import (
     Predictions,
     check_actions,
+    observed,
     offline_metrics,
     policy_errors,
     predict,
@@ -83,6 +84,13 @@ def test_a_constant_shift_is_found_in_metres(feature_set):
     np.testing.assert_allclose(found, np.abs(SHIFT[:3]), atol=1e-6)
     assert metrics.rmse_m == pytest.approx(0.003, abs=1e-6) and metrics.mean_m == pytest.approx(0.003, abs=1e-6)
     assert metrics.consistency_m == pytest.approx(0, abs=1e-6)
+
+
+def test_a_policy_of_two_observations_is_shown_two_and_the_labels_of_one(feature_set):
+    asks = SimpleNamespace(observation_delta_indices=[-1, 0], action_delta_indices=[0, 1], reward_delta_indices=None)
+    view = observed(feature_set, SimpleNamespace(config=asks))
+    both = torch.stack([feature_set[frame]["observation.state"] for frame in (4, 5)])
+    assert torch.equal(view[5]["observation.state"], both) and view[5]["action"].shape == (4,)
 
 
 def test_a_policy_without_chunks_has_no_consistency(feature_set):
