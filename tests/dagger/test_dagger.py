@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.dagger import rounds
 from lerobot_constructskill.dagger.merge import obtain_data, parts_of
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
@@ -111,6 +113,32 @@ def test_killed_at_several_stages_it_ends_in_the_same_bytes(made, settings, tmp_
             outcome.write_text("")  # as a power cut may leave it
     call("constructskill-dagger", *slowly)
     assert hashes(tmp_path / "set") == hashes(made[0])
+
+
+def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, settings, tmp_path, monkeypatch):
+    """The quick one of the test above: both episodes are driven, one is then damaged as a power cut may do it."""
+    plan = Plan(parse(DaggerConfig, ["--repo_id=local/driven"], settings))
+    store = Store(shutil.copytree(settings.parent / "store", tmp_path / "store", symlinks=True))
+    folder = store.folder(plan.round(1))
+    before, asked, drive = hashes(folder), [], rounds._drive
+    shutil.rmtree(folder)
+    order = "meta/stats.json"  # LeRobot lists columns in the order of a set; the whole data set's are sorted
+
+    def stop(*_):
+        raise MemoryError
+
+    def note(plan, number, seeds, *others):
+        asked.append(list(seeds))
+        return drive(plan, number, seeds, *others)
+
+    monkeypatch.setattr(rounds, "_drive", note)
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(rounds, "aggregate", stop)
+        rounds.obtain_round(plan, 1, store)
+    next(tmp_path.rglob(f"{asked[0][0]}/outcome.json")).write_text("")
+    rounds.obtain_round(plan, 1, store)
+    both = list(plan.seeds(1))
+    assert asked == [both, both[:1]] and hashes(folder) | {order: None} == before | {order: None}
 
 
 @pytest.mark.parametrize("readout", ["heat_maps", "spatial_softmax"])

@@ -266,7 +266,7 @@ def generate(root, *flags):
         sys.executable,
         "-m",
         "lerobot_constructskill.scripts.generate",
-        "--repo_id=local/set",
+        "--repo_id=local/demos",
         f"--root={root}",
     ]
     return subprocess.Popen([*command, *flags], stderr=subprocess.PIPE, text=True)
