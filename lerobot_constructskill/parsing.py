@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import shlex
 import tempfile
 import traceback
@@ -81,8 +82,13 @@ def _plain(path: Path | str | None) -> Iterator[Path | str | None]:
 
 
 def _readable(flag: str) -> str:
-    """A flag whose value YAML can read: in quotation marks where it cannot."""
+    """A flag whose value YAML can read, in quotation marks where it cannot; `~` is the home folder, as shells have it.
+
+    They leave it alone behind an equals sign.
+    """
     name, _, value = flag.partition("=")
+    if value.startswith("~/"):
+        flag = f"{name}={(value := os.path.expanduser(value))}"
     try:
         yaml.compose(value, Loader=yaml.SafeLoader)
     except yaml.YAMLError:

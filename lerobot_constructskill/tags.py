@@ -12,9 +12,41 @@ import yaml
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.presets import named
 
+MERGE = "tag:yaml.org,2002:merge"
+
+MOST_VALUES = 100_000
+"""In a file, with those that its aliases stand for: a few hundred bytes of aliases can stand for billions."""
+
 
 class Loader(yaml.SafeLoader):
-    """PyYAML's safe loader with `!policy`, which takes names of shipped policies and opens no other file."""
+    """PyYAML's safe loader with `!policy`, which takes names of shipped policies and opens no other file.
+
+    A key that stands twice is refused: PyYAML keeps the last one alone.
+    """
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None and _count(node, {}) > MOST_VALUES:
+            raise InputError(f"'{self.name}' stands for more than {MOST_VALUES} values: its aliases multiply.")
+        return node
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        known = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != MERGE and (key.value in known or known.add(key.value)):
+                line = key.start_mark.line + 1
+                raise InputError(f"'{self.name}', line {line}: '{key.value}' stands there a second time; keep one.")
+        return super().construct_mapping(node, deep)
+
+
+def _count(node: yaml.Node, counted: dict[int, int]) -> int:
+    """The values that a node stands for. What it holds itself, which YAML allows, counts as too many."""
+    if id(node) not in counted:
+        counted[id(node)] = MOST_VALUES + 1
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        parts = [one for part in parts for one in (part if isinstance(part, tuple) else (part,))]
+        counted[id(node)] = 1 + sum(_count(part, counted) for part in parts)
+    return counted[id(node)]
 
 
 def _policy(loader: Loader, node: yaml.Node) -> dict[str, Any]:
@@ -37,8 +69,11 @@ def read(path: Path | str) -> Any:
     Raises:
         OSError: the file cannot be opened.
         MissingError: a `!policy` in it names no shipped policy.
-        InputError: a `!policy` in it names none at all.
+        InputError: a `!policy` in it names none at all, a key stands twice, or it is too large or too deep.
         yaml.YAMLError: it is no YAML.
     """
     with open(path, encoding="utf-8") as file:
-        return yaml.load(file, Loader)
+        try:
+            return yaml.load(file, Loader)
+        except RecursionError:
+            raise InputError(f"'{path}' is nested too deeply.") from None

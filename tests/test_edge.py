@@ -111,6 +111,12 @@ def test_every_command_with_a_configuration_is_tried() -> None:
     assert set(config_classes()) - {"frozen_vit", "constructskill"} == set(SCRIPTS) - BARE
 
 
+def test_the_home_folder_is_found_behind_an_equals_sign(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    made = parsing.parse(config_classes()["constructskill-check"], ["--root=~/x"])
+    assert made.root == tmp_path / "x"
+
+
 @pytest.mark.parametrize(("command", "field"), CASES)
 def test_a_bad_value_is_a_sentence_or_valid(command: str, field: str, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)

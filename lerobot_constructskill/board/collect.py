@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import yaml
@@ -27,14 +27,25 @@ def recorded_in(root: Path) -> Piles:
 
     Raises:
         MissingError: there is no such folder.
-        InputError: a file in one is no recording.
+        InputError: a file in one is no recording, or a folder is no training seed's, or another one is as well.
     """
-    folders = {int(found[1]): path for path in sorted(root.glob("seed_*")) if (found := re.fullmatch(SEED, path.name))}
+    folders: dict[int, Path] = {}
+    for path in sorted(root.glob("seed_*")):
+        found = re.fullmatch(SEED, path.name)
+        if found is None:
+            raise InputError(f"'{path}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        if (other := folders.setdefault(int(found[1]), path)) != path:
+            raise InputError(f"'{other}' and '{path}' are of the same training seed: name one otherwise.")
     if not folders:
         raise MissingError(f"'{root}' has no folder seed_0, seed_1, ... of recordings.")
-    # A name with a dot is a file that a process has not finished, or never did.
-    files = {seed: sorted(folder.rglob("[!.]*.parquet")) for seed, folder in folders.items()}
-    return {seed: [one for path in paths for one in read_recordings(path)] for seed, paths in files.items()}
+    return {seed: list(_recordings(folder)) for seed, folder in folders.items()}
+
+
+def _recordings(folder: Path) -> Iterator[Recording]:
+    """A name with a dot is a file that a process has not finished, or never did."""
+    for path in sorted(folder.rglob("[!.]*")):
+        if path.suffix.lower() == ".parquet":
+            yield from read_recordings(path)
 
 
 def of_study(

@@ -103,7 +103,8 @@ def read_entries(root: Path) -> list[Entry]:
     """
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
-    return [_entry(root, path) for path in sorted((root / ENTRIES).iterdir())]
+    # What ends in .partial is being written, or was when its process was killed.
+    return [_entry(root, path) for path in sorted((root / ENTRIES).iterdir()) if path.suffix != ".partial"]
 
 
 def _entry(root: Path, path: Path) -> Entry:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import fields
 from math import inf
 from pathlib import Path
@@ -18,7 +19,7 @@ from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
 from lerobot_constructskill.board.submission import Claim
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 
-TABLE = "board.parquet"
+TABLE, EXPORTS = "board.parquet", "exports"
 
 
 def write_table(entries: Iterable[Entry], path: Path) -> None:
@@ -136,9 +137,11 @@ def _is_official(entry: Entry) -> bool:
 def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
     """Write all of them: a folder for each entry in `exports`, and the files that are of all."""
     write_table(entries, out / TABLE)
-    _write(out / "exports" / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2))
+    for gone in {path.name for path in (out / EXPORTS).glob("*/")} - {entry.name for entry in entries}:
+        _withdraw(out / EXPORTS / gone)
+    _write(out / EXPORTS / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2))
     for entry in entries:
-        folder = out / "exports" / entry.name
+        folder = out / EXPORTS / entry.name
         for seed in entry.said.training_seeds:
             _write(folder / f"seed_{seed}" / "eval_info.json", json.dumps(eval_info(entry, seed), indent=2))
         results = folder / ".eval_results" / "constructskill.yaml"
@@ -146,6 +149,16 @@ def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | N
             _write(results, eval_results(entry, dataset_id))
         elif not _is_official(entry):
             results.unlink(missing_ok=True)  # of when it was
+
+
+def _withdraw(folder: Path) -> None:
+    """Remove what was written of an entry that is no longer there, and nothing else."""
+    for file in (*folder.glob("seed_*/eval_info.json"), folder / ".eval_results" / "constructskill.yaml"):
+        file.unlink(missing_ok=True)
+        with suppress(OSError):  # it holds something of somebody's, or is not there
+            file.parent.rmdir()
+    with suppress(OSError):
+        folder.rmdir()
 
 
 def _write(path: Path, text: str) -> None:

@@ -73,6 +73,15 @@ def verify(config: VerifyConfig) -> str:
 
 def _record(path: Path, facts: dict) -> None:
     """Write what was found. What else is known of the submission stays: the first date, other machines, a re-run."""
+    from lerobot_constructskill.artifacts.locks import locked
+
+    lock = path.with_name(f".{path.name}.lock")
+    with locked(lock):  # of two at once the second adds to what the first has written
+        _add(path, facts)
+        lock.unlink()
+
+
+def _add(path: Path, facts: dict) -> None:
     from lerobot_constructskill.artifacts.folders import replaced
     from lerobot_constructskill.artifacts.processor import processor
     from lerobot_constructskill.board.entries import read_verdict

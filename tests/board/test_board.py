@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import threading
+import time
 from dataclasses import replace
 from datetime import UTC, datetime
 from html.parser import HTMLParser
@@ -13,6 +15,7 @@ import pytest
 import yaml
 
 from lerobot_constructskill.artifacts import processor
+from lerobot_constructskill.board import entries as entries_module
 from lerobot_constructskill.board import films
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.exports import eval_info, write_exports
@@ -120,6 +123,45 @@ def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
     write_exports(entries[::2], tmp_path, "today", "alice/bench")
     assert not list(tmp_path.glob("exports/*/.eval_results/*"))
     assert not json.loads((tmp_path / "exports" / "leaderboard.json").read_text())["results"]
+
+
+def test_of_an_entry_that_was_withdrawn_no_export_stays_and_what_is_somebody_elses_does(many, tmp_path):
+    board = shutil.copytree(many, tmp_path / "board")
+    write_board(board, tmp_path / "site", "alice/bench")
+    notes = tmp_path / "site" / "exports" / "mine" / "notes.txt"
+    notes.parent.mkdir()
+    notes.touch()
+    shutil.rmtree(board / "entries" / "good")
+    write_board(board, tmp_path / "site", "alice/bench")
+    assert {path.name for path in (tmp_path / "site" / "exports").glob("*/")} == {"bad", "few", "mine"}
+    assert notes.is_file()
+
+
+def test_an_entry_that_is_being_written_is_not_read(many, tmp_path):
+    board = shutil.copytree(many, tmp_path / "board")
+    (board / "entries" / "new.partial").mkdir()
+    assert [entry.name for entry in read_entries(board)] == [entry.name for entry in read_entries(many)]
+
+
+def test_of_two_verdicts_at_once_none_is_lost(tmp_path, monkeypatch):
+    """Both read before either writes, but for the lock."""
+    read, facts = entries_module.read_verdict, {"submission": "0" * 64, "level": "replayed", "versions": {}}
+
+    def slowly(*of):
+        verdict = read(*of)
+        time.sleep(0.2)
+        return verdict
+
+    monkeypatch.setattr(entries_module, "read_verdict", slowly)
+    monkeypatch.setattr(processor, "processor", lambda: threading.current_thread().name)
+    path = tmp_path / "verified" / "entry.json"
+    threads = [threading.Thread(target=_record, args=(path, facts), name=name) for name in ("one", "two")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(json.loads(path.read_text())["machines"]) == ["one", "two"]
+    assert [file.name for file in path.parent.iterdir()] == ["entry.json"]
 
 
 def test_what_a_stranger_writes_is_text(many, tmp_path):

@@ -52,6 +52,26 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
     assert submission.declaration.backend == "physx_cpu, none rendering"
 
 
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("seed_00", "seed_0' and '.*seed_00' are of the same training seed"),
+        ("seed_99999999999", "seed_99999999999' is of no training seed"),
+        ("seed_one", "seed_one' is of no training seed"),
+    ],
+)
+def test_no_folder_of_recordings_is_left_out_without_a_word(name, said, recorded):
+    (recorded / name).mkdir()
+    with pytest.raises(InputError, match=said):
+        recorded_in(recorded)
+
+
+def test_a_recording_is_one_however_its_ending_is_written(recorded):
+    before = len(recorded_in(recorded)[0])
+    next((recorded / "seed_0").glob("*.parquet")).rename(recorded / "seed_0" / "x.PARQUET")
+    assert len(recorded_in(recorded)[0]) == before
+
+
 def test_what_a_killed_process_left_is_not_read(recorded, tmp_path):
     (recorded / "seed_0" / ".host-1.block_to_bin-7.parquet").write_bytes(b"PAR1")
     assert len(made(tmp_path / "made", recorded_in(recorded)).claims) == 8
