@@ -1,13 +1,14 @@
 """Our configuration files: nothing in one is dropped without a word, and none takes the machine with it."""
 
+from itertools import pairwise
+
 import pytest
 
 from lerobot_constructskill import tags
 from lerobot_constructskill.errors import InputError
 
-TENFOLD = "".join(
-    f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n" for before, name in zip("abcdefg", "bcdefgh")
-)
+NAMES = "abcdefgh"
+TENFOLD = "".join(f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n" for before, name in pairwise(NAMES))
 
 
 @pytest.mark.parametrize(
