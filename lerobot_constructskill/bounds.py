@@ -120,6 +120,12 @@ class Present:
         return "a device that PyTorch finds on this machine, such as cpu or cuda"
 
 
+UNSEEN = (
+    "\x00-\x1f\x7f-\x9f\xad\u061c\u115f\u1160\u200b-\u200f\u2028-\u202e\u2060-\u206f\u2800\u3164"
+    "\ud800-\udfff\ufeff\uffa0\U000e0000-\U000e0fff"
+)
+"""Characters that cannot be seen, turn text around, or are halves of one, which no file can hold."""
+
 _WORD = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 
 Count = Annotated[int, Range(1, 1_000_000)]
@@ -129,7 +135,7 @@ Workers = Annotated[int, Range(1, 1024)]
 Seed = Annotated[int, Range(0, 2**31 - 1)]
 Episode = Annotated[int, Range(0, 10_000_000)]
 Episodes = Annotated[list[Episode], NotEmpty()]
-Text = Annotated[str, Pattern(r"[^\x00-\x1f]*\S[^\x00-\x1f]*", "one line of text")]
+Text = Annotated[str, Pattern(rf"(?=.*\S)[^{UNSEEN}]+", "one line of text")]
 Word = Annotated[str, Pattern(_WORD, "a name of letters, digits, '_', '-' and '.'")]
 RepoId = Annotated[str, Pattern(rf"{_WORD}/{_WORD}", "user/name, each of letters, digits, '_', '-' and '.'")]
 Device = Annotated[str, Present()]

@@ -58,6 +58,11 @@ class Config:
         ("name", "a/" + "b" * 97, "must be user/name"),
         ("label", "", "one line of text, not ''."),
         ("label", "a\nb", "one line of text"),
+        *(
+            ("label", text, "one line of text")
+            for text in ("\x1b", "a\x1b[1m", " ", "\ud800", "\u2800", "\u3164", "a\xad")
+        ),
+        *(("label", text, "one line of text") for text in ("\u061c", "\U000e0041", "\u202eb", "\u200b")),
         ("root", "a\0b", "a path"),
         ("device", "quantum", "a device that PyTorch finds"),
         ("device", "cpu; rm", "a device that PyTorch finds"),

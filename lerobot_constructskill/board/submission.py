@@ -20,7 +20,7 @@ import yaml
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.board.protocol import PHYSICS, SUITES, Setting, class_of
 from lerobot_constructskill.board.strangers import bounded_memory, make, read_files, read_yaml
-from lerobot_constructskill.bounds import Among, NotEmpty, Pattern, Seed, check
+from lerobot_constructskill.bounds import UNSEEN, Among, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import OBS_TYPES, STAGES, TASKS, get_task
 from lerobot_constructskill.envs.actions import within_reach
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
@@ -38,9 +38,6 @@ SLACK = 256 << 20
 """Bytes that reading takes beside what is read."""
 
 VERSION = 1
-
-UNSEEN = "\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u2069\ufeff"
-"""Characters that cannot be seen, or turn text around."""
 
 LINE = Pattern(rf"(?=.*\S)[^{UNSEEN}]{{1,300}}", "one line of text, of at most 300 characters")
 Line = Annotated[str, LINE]
