@@ -52,7 +52,8 @@ def install(root: Path, project: dict) -> str:
     section = (root / "README.md").read_text().partition("## Install\n")[2].partition("\n## ")[0]
     extras = [f"| `{name}` | {', '.join(packages)} |" for name, packages in project["optional-dependencies"].items()]
     table = "\n".join(["| extra | packages |", "|---|---|", *extras])
-    return f"# Install\n{section.replace('(docs/', '(../docs/')}\n## Extras\n\n{table}\n"
+    section = re.sub(r"\]\((?!\w+:|#)", "](../", section)
+    return f"# Install\n{section}\n## Extras\n\n{table}\n"
 
 
 def commands(scripts: dict[str, str]) -> str:
