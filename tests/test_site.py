@@ -18,7 +18,7 @@ from printed import PAGES, ROOT
 from lerobot_constructskill.contract import SHIPPED
 
 pytest.importorskip("material", reason="the extra `docs` builds the site")
-pytestmark = pytest.mark.nightly
+pytestmark = pytest.mark.slow
 
 LARGEST = 16e6
 """Bytes of the whole site."""
@@ -122,6 +122,7 @@ class Handler(http.server.SimpleHTTPRequestHandler):
         pass
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("opened", ["server", "file"])
 def test_in_a_browser_the_search_finds_a_task_and_nothing_foreign_is_asked(opened, site, server, browser):
     from playwright.sync_api import expect
