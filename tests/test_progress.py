@@ -36,3 +36,12 @@ def test_a_log_gets_few_lines_of_much_work(monkeypatch):
         for _ in range(1000):
             bar.update()
     assert stream.getvalue().count("\r") <= 2 and "1000/1000" in stream.getvalue()
+
+
+def test_after_a_burst_a_single_piece_shows_too(monkeypatch):
+    """tqdm's own rule would wait for as many pieces as came at once before."""
+    monkeypatch.setattr(progress, "LOG_INTERVAL_S", 0)
+    with bar_on(stream := StringIO(), monkeypatch, total=2000) as bar:
+        bar.update(1000)
+        bar.update()
+        assert "1001/2000" in stream.getvalue()
