@@ -9,6 +9,7 @@ Also the first picture of a process, against SAPIEN's own shader, which has a ta
 
 import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -16,7 +17,7 @@ import numpy as np
 from measure import report
 
 TURNS, EPISODES = 3, 10
-OURS, ALL_OBJECTS = "ours", "the garbage collector looks at what was imported"
+ALL_OBJECTS = "the garbage collector looks at what was imported"
 
 
 def seconds_a_reset(spare_imports: bool, render_backend: str) -> float:
@@ -54,27 +55,24 @@ def seconds_to_the_first_picture(own_shader: bool) -> float:
     return time.process_time() - start
 
 
-def first_pictures() -> None:
+def in_turns(seconds_of: Callable[..., float], *arguments: object) -> dict[bool, float]:
+    """Mean seconds with and without what is ours, each time in a process of its own."""
     seconds = {True: 0.0, False: 0.0}
     for _ in range(TURNS):
-        for own_shader in seconds:
+        for ours in seconds:
             with ProcessPoolExecutor(1, get_context("spawn")) as worker:
-                seconds[own_shader] += worker.submit(seconds_to_the_first_picture, own_shader).result() / TURNS
-    what = "first pictures of a process per second of CPU time"
-    report(what, 1 / seconds[True], "SAPIEN's own shader", 1 / seconds[False])
+                seconds[ours] += worker.submit(seconds_of, ours, *arguments).result() / TURNS
+    return seconds
 
 
 def main() -> None:
     os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     for render_backend, what in (("cpu", "rendering"), ("none", "without rendering, as in a replay")):
-        seconds = {OURS: 0.0, ALL_OBJECTS: 0.0}
-        for _ in range(TURNS):
-            for name in seconds:
-                with ProcessPoolExecutor(1, get_context("spawn")) as worker:
-                    seconds[name] += worker.submit(seconds_a_reset, name == OURS, render_backend).result() / TURNS
-        rates = {name: 1 / taken for name, taken in seconds.items()}
-        report(f"resets per second of CPU time, {what}", rates[OURS], ALL_OBJECTS, rates[ALL_OBJECTS])
-    first_pictures()
+        seconds = in_turns(seconds_a_reset, render_backend)
+        report(f"resets per second of CPU time, {what}", 1 / seconds[True], ALL_OBJECTS, 1 / seconds[False])
+    seconds = in_turns(seconds_to_the_first_picture)
+    what = "first pictures of a process per second of CPU time"
+    report(what, 1 / seconds[True], "SAPIEN's own shader", 1 / seconds[False])
 
 
 if __name__ == "__main__":

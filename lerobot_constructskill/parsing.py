@@ -82,9 +82,9 @@ def _plain(path: Path | str | None) -> Iterator[Path | str | None]:
 
 
 def _readable(flag: str) -> str:
-    """A flag whose value YAML can read, in quotation marks where it cannot; `~` is the home folder, as shells have it.
+    """A flag whose value YAML can read: in quotation marks where it cannot.
 
-    They leave it alone behind an equals sign.
+    `~/` is the home folder; a shell does not replace it behind an equals sign.
     """
     name, _, value = flag.partition("=")
     if value.startswith("~/"):

@@ -32,10 +32,11 @@ class Loader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         known = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != MERGE and (key.value in known or known.add(key.value)):
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != MERGE):
+            if key.value in known:
                 line = key.start_mark.line + 1
                 raise InputError(f"'{self.name}', line {line}: '{key.value}' stands there a second time; keep one.")
+            known.add(key.value)
         return super().construct_mapping(node, deep)
 
 

@@ -25,6 +25,7 @@ from queue import Queue
 
 from libcst import FunctionDef, Module
 from mutmut.mutation.file_mutation import Mutation, create_mutations
+from test_packaging import own_files
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "lerobot_constructskill"
@@ -84,13 +85,6 @@ def draw(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
     drawn = [rng.choice(list(of)) for _, of in rooms]
     rest = [one for one in mutants if one not in drawn]
     return drawn + rng.sample(rest, max(0, count - len(drawn)))
-
-
-def own_files() -> list[str]:
-    """Every file that is, or would be, committed."""
-    listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    named = subprocess.check_output(listing, cwd=ROOT, text=True).split("\0")
-    return [name for name in sorted(named) if (ROOT / name).is_file()]
 
 
 def make_copy(folder: Path) -> Path:

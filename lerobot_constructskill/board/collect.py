@@ -42,7 +42,7 @@ def recorded_in(root: Path) -> Piles:
 
 
 def _recordings(folder: Path) -> Iterator[Recording]:
-    """A name with a dot is a file that a process has not finished, or never did."""
+    """What its files hold. A name that begins with a dot is of a file that was never finished."""
     for path in sorted(folder.rglob("[!.]*")):
         if path.suffix.lower() == ".parquet":
             yield from read_recordings(path)
