@@ -60,7 +60,7 @@ def test_a_published_study_is_one_of_configs_with_as_many_seeds_or_fewer(folder)
 @pytest.mark.parametrize("folder", one_and_nightly_the_others(), ids=lambda folder: folder.name)
 def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     """Its Markdown, that is: the figures are not drawn, which takes most of a report's time."""
-    monkeypatch.setattr(ink, "encoded", lambda drawing, paper, *formats: [b""] * len(formats))
+    monkeypatch.setattr(ink, "encoded", lambda drawing, *formats: [b""] * len(formats))
     copy = shutil.copytree(folder, tmp_path / folder.name)
     report(ReportConfig(copy))
     assert (copy / "report.md").read_text() == (folder / "report.md").read_text()

@@ -10,7 +10,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
 from lerobot_constructskill.analysis.report.findings import Findings, Line, SettingFindings, Sweep
-from lerobot_constructskill.analysis.report.ink import MARKERS, Drawing, Ink, panels
+from lerobot_constructskill.analysis.report.ink import (
+    ALARM,
+    MARKERS,
+    MUTED,
+    PAPER,
+    RAMP,
+    RULE,
+    SERIES,
+    Drawing,
+    panels,
+)
 from lerobot_constructskill.analysis.stats.comparisons import Comparison
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA
 from lerobot_constructskill.analysis.stats.power import detectable_difference, wrong_order
@@ -25,16 +35,16 @@ def outcome_figure(setting: SettingFindings) -> Drawing:
     lines = [line for line in setting.lines if line.outcomes]
     references = [line for line in setting.references if line.outcomes]
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         figure, axes = panels(0.9 + 0.32 * (len(lines) + len(references)), sharey=True)
         for axis, criterion in zip(axes, CRITERIA, strict=True):
             for y, line in enumerate(lines):
-                _interval(axis, y, line, criterion, ink)
+                _interval(axis, y, line, criterion)
             for y, line in enumerate(references, start=len(lines)):
                 share = line.outcomes[criterion].counts.rate
-                axis.plot(share, y, "D", color=ink.paper, markeredgecolor=ink.muted, markersize=6, clip_on=False)
+                axis.plot(share, y, "D", color=PAPER, markeredgecolor=MUTED, markersize=6, clip_on=False)
             if references:
-                axis.axhline(len(lines) - 0.5, color=ink.rule, linewidth=0.8)
+                axis.axhline(len(lines) - 0.5, color=RULE, linewidth=0.8)
             axis.set(title=criterion.capitalize(), xlim=(0, 1), xlabel="share of seeds", xticks=np.linspace(0, 1, 5))
             axis.set_xticklabels(["0", "¼", "½", "¾", "1"])
             axis.grid(axis="x", linewidth=0.6)
@@ -56,15 +66,15 @@ def grid_figure(setting: SettingFindings, episodes: int) -> Drawing:
     seeds = sorted({seed for line in setting.lines for seed in line.training_seeds})
     stacked = len(seeds) > 12
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         rows, columns = (2, 1) if stacked else (1, 2)
         height = rows * (0.75 + 0.3 * len(setting.lines)) + 0.45
         figure, axes = panels(height, rows, columns, sharey=True)
         for axis, criterion in zip(axes, CRITERIA, strict=True):
-            _grid(axis, setting.lines, criterion, seeds, episodes, ink)
+            _grid(axis, setting.lines, criterion, seeds, episodes)
         for axis in axes[:1] if not stacked else axes:
             axis.set_yticks(range(len(setting.lines)), [_wrap(line.label) for line in setting.lines])
-        figure.legend(handles=_cell_key(episodes, ink), loc="outside lower right", ncols=5, fontsize=8)
+        figure.legend(handles=_cell_key(episodes), loc="outside lower right", ncols=5, fontsize=8)
         return figure
 
     caption = (
@@ -81,7 +91,7 @@ def error_figure(setting: SettingFindings, episodes: int) -> Drawing | None:
         return None
     errors = np.concatenate([line.runs["heldout_mse_m2"].dropna() for line in lines])
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         figure, axes = panels(3.5 + 0.18 * (len(lines) // 4), sharex=True, sharey=True)
         for axis, criterion in zip(axes, CRITERIA, strict=True):
             for i, line in enumerate(lines):
@@ -91,8 +101,8 @@ def error_figure(setting: SettingFindings, episodes: int) -> Drawing | None:
                     line.runs["heldout_mse_m2"] * 1e4,
                     line.runs[criterion] + offset,
                     MARKERS[i % len(MARKERS)],
-                    color=ink.series[i % len(ink.series)],
-                    markeredgecolor=ink.paper,
+                    color=SERIES[i % len(SERIES)],
+                    markeredgecolor=PAPER,
                     markeredgewidth=0.6,
                     markersize=6.5,
                     alpha=0.9,
@@ -123,20 +133,20 @@ def ranking_figure(setting: SettingFindings) -> Drawing | None:
     if not any(pairs.values()):
         return None
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         figure, axes = panels(3.5, sharey=True)
         for axis, criterion in zip(axes, CRITERIA, strict=True):
             for i, pair in enumerate(pairs[criterion]):
                 chances = [wrong_order(pair.counts_a.rate, pair.counts_b.rate, seeds) for seeds in SEEDS]
                 label = f"{setting.labels[pair.a]} v {setting.labels[pair.b]}"
-                colour, marker = ink.series[i % len(ink.series)], MARKERS[i % len(MARKERS)]
+                colour, marker = SERIES[i % len(SERIES)], MARKERS[i % len(MARKERS)]
                 axis.plot(SEEDS, chances, marker=marker, markersize=4, color=colour, label=fill(label, 40))
             _seeds_axis(axis, criterion.capitalize(), "seeds a variant")
             if pairs[criterion]:
                 axis.legend(fontsize=7.5, loc="upper right")
             else:
                 axis.text(
-                    0.5, 0.5, "no observed difference at risk", transform=axis.transAxes, ha="center", color=ink.muted
+                    0.5, 0.5, "no observed difference at risk", transform=axis.transAxes, ha="center", color=MUTED
                 )
         axes[0].set_ylabel("chance of the wrong order")
         axes[0].set_ylim(0, 0.5)
@@ -156,12 +166,12 @@ def sweep_figure(findings: Findings) -> Drawing:
     sweeps, columns = findings.sweeps, min(4, len(findings.sweeps))
     lines = findings.swept_lines
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         rows = -(-len(sweeps) // columns)
         figure, axes = panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
         for axis, sweep in zip(axes, sweeps, strict=False):
             for i, line in enumerate(lines):
-                colour = ink.series[i % len(ink.series)] if line.role == VARIANT else ink.muted
+                colour = SERIES[i % len(SERIES)] if line.role == VARIANT else MUTED
                 _along(axis, sweep, line, colour, MARKERS[i % len(MARKERS)])
             names = [fill(setting.label, 10, break_long_words=False) for setting in sweep.settings]
             axis.set_xticks(range(len(names)), names, fontsize=7.5)
@@ -190,18 +200,18 @@ def detectable_figure(findings: Findings) -> Drawing:
     numbers = {line.seeds for setting in findings.settings for line in setting.lines}
     planned = sorted(number for number in numbers if SEEDS[0] <= number <= SEEDS[-1])
 
-    def draw(ink: Ink) -> Figure:
+    def draw() -> Figure:
         figure, (axis,) = panels(3.5, columns=1)
         for i, rate in enumerate(rates):
             shares = [_worse_share(rate, seeds, findings.alpha) for seeds in SEEDS]
-            axis.plot(SEEDS, shares, color=ink.series[i], marker=MARKERS[i], markersize=4)
+            axis.plot(SEEDS, shares, color=SERIES[i], marker=MARKERS[i], markersize=4)
             axis.annotate(f"better one in {rate:.0%}", (SEEDS[-1], shares[-1]), xytext=(8, 0), va="center",
                           textcoords="offset points", fontsize=8.5, annotation_clip=False)  # fmt: skip
         _seeds_axis(axis, "", "seeds a variant")
         for seeds in planned:
-            axis.axvline(seeds, color=ink.muted, linewidth=1, linestyle=(0, (4, 3)))
+            axis.axvline(seeds, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
             axis.annotate(f"{seeds} planned", (seeds, 1), xytext=(0, 4), textcoords="offset points", fontsize=8,
-                          color=ink.muted, ha="center")  # fmt: skip
+                          color=MUTED, ha="center")  # fmt: skip
         axis.set(ylim=(0, 1), ylabel="worse variant succeeds in at most")
         axis.set_yticks(np.linspace(0, 1, 6), [f"{value:.0%}" for value in np.linspace(0, 1, 6)])
         return figure
@@ -234,21 +244,21 @@ def _along(axis: Axes, sweep: Sweep, of: Line, colour: str, marker: str) -> None
     axis.plot(places, seeds.mean(), marker=marker, color=colour, label=_wrap(of.label), **form)
 
 
-def _interval(axis: Axes, y: int, line: Line, criterion: str, ink: Ink) -> None:
+def _interval(axis: Axes, y: int, line: Line, criterion: str) -> None:
     counts, exact = line.outcomes[criterion].counts, line.outcomes[criterion].exact
-    axis.plot([exact.low, exact.high], [y, y], color=ink.series[0], linewidth=3.2, alpha=0.35, solid_capstyle="round")
-    axis.plot(exact.value, y, "o", color=ink.series[0], markersize=6.5, clip_on=False)
+    axis.plot([exact.low, exact.high], [y, y], color=SERIES[0], linewidth=3.2, alpha=0.35, solid_capstyle="round")
+    axis.plot(exact.value, y, "o", color=SERIES[0], markersize=6.5, clip_on=False)
     axis.annotate(f"{counts.met}/{counts.seeds}", (1, y), xytext=(10, 0), textcoords="offset points", va="center",
                   fontsize=8.5, annotation_clip=False)  # fmt: skip
 
 
-def _grid(axis: Axes, lines: list[Line], criterion: str, seeds: list[int], episodes: int, ink: Ink) -> None:
-    ramp = LinearSegmentedColormap.from_list("ramp", ink.ramp)
+def _grid(axis: Axes, lines: list[Line], criterion: str, seeds: list[int], episodes: int) -> None:
+    ramp = LinearSegmentedColormap.from_list("ramp", RAMP)
     for y, line in enumerate(lines):
         runs = line.runs.set_index("training_seed")
         for seed in line.training_seeds:
             run = runs.loc[seed] if seed in runs.index else None
-            _cell(axis, seeds.index(seed), y, run, criterion, episodes, ramp, ink)
+            _cell(axis, seeds.index(seed), y, run, criterion, episodes, ramp)
         if line.outcomes:
             counts = line.outcomes[criterion].counts
             axis.annotate(f"{counts.met}/{counts.seeds}", (len(seeds) - 0.4, y), va="center", xytext=(3, 0),
@@ -263,28 +273,27 @@ def _grid(axis: Axes, lines: list[Line], criterion: str, seeds: list[int], episo
     axis.spines[:].set_visible(False)
 
 
-def _cell(axis: Axes, x: int, y: int, run, criterion: str, episodes: int, ramp, ink: Ink) -> None:
+def _cell(axis: Axes, x: int, y: int, run, criterion: str, episodes: int, ramp) -> None:
     place = {"xy": (x - 0.45, y - 0.42), "width": 0.9, "height": 0.84}
     if run is None:
-        axis.add_patch(Rectangle(**place, fill=False, edgecolor=ink.muted, linewidth=0.7, linestyle=(0, (2, 2))))
+        axis.add_patch(Rectangle(**place, fill=False, edgecolor=MUTED, linewidth=0.7, linestyle=(0, (2, 2))))
         return
     if pd.notna(run["error_kind"]):
-        axis.add_patch(Rectangle(**place, facecolor=ink.paper, edgecolor=ink.alarm, linewidth=0.8))
-        axis.text(x, y, "×", ha="center", va="center", color=ink.alarm, fontsize=10)
+        axis.add_patch(Rectangle(**place, facecolor=PAPER, edgecolor=ALARM, linewidth=0.8))
+        axis.text(x, y, "×", ha="center", va="center", color=ALARM, fontsize=10)
         return
     share = run[criterion] / episodes
     axis.add_patch(Rectangle(**place, facecolor=ramp(share), edgecolor="none"))
-    light_text = (share > 0.55) == (ink.paper == "#ffffff")
-    colour = ("#ffffff" if light_text else "#0c1116") if share else ink.muted
+    colour = (PAPER if share > 0.55 else "#0c1116") if share else MUTED
     axis.text(x, y, f"{run[criterion]}", ha="center", va="center", color=colour, fontsize=8)
 
 
-def _cell_key(episodes: int, ink: Ink) -> list[Patch]:
-    shades = [(ink.ramp[0], "no episode"), (ink.ramp[1], "half"), (ink.ramp[2], f"all {episodes}")]
+def _cell_key(episodes: int) -> list[Patch]:
+    shades = [(RAMP[0], "no episode"), (RAMP[1], "half"), (RAMP[2], f"all {episodes}")]
     return [
         *(Patch(facecolor=colour, label=label) for colour, label in shades),
-        Patch(facecolor=ink.paper, edgecolor=ink.alarm, label="× run failed"),
-        Patch(facecolor=ink.paper, edgecolor=ink.muted, linewidth=0.7, linestyle=(0, (2, 2)), label="not run yet"),
+        Patch(facecolor=PAPER, edgecolor=ALARM, label="× run failed"),
+        Patch(facecolor=PAPER, edgecolor=MUTED, linewidth=0.7, linestyle=(0, (2, 2)), label="not run yet"),
     ]
 
 

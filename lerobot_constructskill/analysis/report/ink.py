@@ -1,10 +1,9 @@
-"""What figures are drawn with: colours for light and dark paper, type, and the files a drawing becomes."""
+"""What figures are drawn with: colours, type, and the files that a drawing becomes."""
 
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -16,47 +15,22 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from lerobot_constructskill.artifacts.folders import replaced
 
-@dataclass(frozen=True)
-class Ink:
-    """Colours of one paper.
+PAPER, TEXT, MUTED, RULE = "#ffffff", "#1c2024", "#667078", "#d5dade"
+"""Background, writing, secondary writing, hairlines."""
 
-    Args:
-        paper, text, muted, rule: background, writing, secondary writing, hairlines.
-        ramp: from nothing to everything, for cells.
-        alarm: failed runs.
-        series: one colour a variant (Okabe and Ito 2008, without yellow), safe for colour-blind readers.
-    """
+RAMP = ("#eef1f4", "#9fc3e0", "#1d5b94")
+"""From nothing to everything, for cells."""
 
-    paper: str
-    text: str
-    muted: str
-    rule: str
-    ramp: tuple[str, ...]
-    alarm: str
-    series: tuple[str, ...]
+ALARM = "#b8400a"
+"""Of failed runs."""
 
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#b0579a", "#d08a00", "#3a9fd6", "#5c6670")
+"""One colour a variant (Okabe and Ito 2008, without yellow), safe for colour-blind readers."""
 
-LIGHT = Ink(
-    paper="#ffffff",
-    text="#1c2024",
-    muted="#667078",
-    rule="#d5dade",
-    ramp=("#eef1f4", "#9fc3e0", "#1d5b94"),
-    alarm="#b8400a",
-    series=("#0072b2", "#d55e00", "#009e73", "#b0579a", "#d08a00", "#3a9fd6", "#5c6670"),
-)
-DARK = Ink(
-    paper="#14181b",
-    text="#e3e7ea",
-    muted="#97a2aa",
-    rule="#363e44",
-    ramp=("#20272c", "#2f6390", "#8cc4f2"),
-    alarm="#f08a56",
-    series=("#4ba8e0", "#f0854a", "#3cc79c", "#dd8fc6", "#e8b04a", "#9fd3f2", "#a8b2ba"),
-)
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", ">")
-"""One more than `series` has colours, so that their pairs repeat after 56 variants only."""
+"""One more than `SERIES` has colours, so that their pairs repeat after 56 variants only."""
 
 IN_QUOTES = " /:=;,'()[]{}<>!*@+$?|"
 """What may stand in the URI of an attribute in double quotes as it is."""
@@ -79,6 +53,19 @@ STYLE = {
     "text.parse_math": False,
     "svg.fonttype": "path",
     "svg.hashsalt": "constructskill",
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+    "text.color": TEXT,
+    "axes.labelcolor": TEXT,
+    "axes.titlecolor": TEXT,
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": TEXT,
+    "ytick.labelcolor": TEXT,
+    "grid.color": RULE,
+    "hatch.color": ALARM,
 }
 
 SHADES = 64
@@ -87,7 +74,7 @@ SHADES = 64
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure of the report, drawn by a function of the ink.
+    """A figure of the report.
 
     Args:
         name: its file's stem.
@@ -97,32 +84,31 @@ class Drawing:
 
     name: str
     caption: str
-    draw: Callable[[Ink], Figure]
+    draw: Callable[[], Figure]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawing on both papers, as data URIs for a page that fetches nothing. Name and caption are the drawing's."""
+    """A drawing as a data URI, for a page that fetches nothing. Name and caption are the drawing's."""
 
     name: str
     caption: str
-    light: Markup
-    dark: Markup
+    source: Markup
 
 
 def picture(drawing: Drawing, folder: Path) -> Picture:
-    """Draw `drawing` on both papers, and write the light one to `folder` as `<name>.png`."""
-    png, light = encoded(drawing, LIGHT, _png, _svg)
-    (dark,) = encoded(drawing, DARK, _svg)
-    (folder / f"{drawing.name}.png").write_bytes(png)
-    return Picture(drawing.name, drawing.caption, _uri(light), _uri(dark))
+    """Draw `drawing`, and write it to `folder` as `<name>.png` as well."""
+    png, svg = encoded(drawing, _png, _svg)
+    with replaced(folder / f"{drawing.name}.png") as partial:
+        partial.write_bytes(png)
+    return Picture(drawing.name, drawing.caption, _uri(svg))
 
 
-def encoded(drawing: Drawing, ink: Ink, *encoders: Callable[[Figure], bytes]) -> list[bytes]:
+def encoded(drawing: Drawing, *encoders: Callable[[Figure], bytes]) -> list[bytes]:
     """One figure as the bytes of a file of each kind, the same at every call."""
-    with styled(ink), warnings.catch_warnings():
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # labels may hold any script
-        figure = drawing.draw(ink)
+        figure = drawing.draw()
         FigureCanvasAgg(figure).draw()
         figure.set_layout_engine("none")  # laid out once, for all files
         return [encode(figure) for encode in encoders]
@@ -149,27 +135,6 @@ def _uri(svg: bytes) -> Markup:
     lines = re.sub(r"<!--.*?-->", "", svg.decode(), flags=re.DOTALL)
     text = " ".join(lines.split()).replace('"', "'")
     return Markup(f"data:image/svg+xml,{quote(text, safe=IN_QUOTES)}")
-
-
-@contextmanager
-def styled(ink: Ink) -> Iterator[None]:
-    colours = {
-        "figure.facecolor": ink.paper,
-        "axes.facecolor": ink.paper,
-        "savefig.facecolor": ink.paper,
-        "text.color": ink.text,
-        "axes.labelcolor": ink.text,
-        "axes.titlecolor": ink.text,
-        "axes.edgecolor": ink.muted,
-        "xtick.color": ink.muted,
-        "ytick.color": ink.muted,
-        "xtick.labelcolor": ink.text,
-        "ytick.labelcolor": ink.text,
-        "grid.color": ink.rule,
-        "hatch.color": ink.alarm,
-    }
-    with matplotlib.rc_context(STYLE | colours):
-        yield
 
 
 def panels(height: float, rows: int = 1, columns: int = 2, **shared) -> tuple[Figure, list[Axes]]:
