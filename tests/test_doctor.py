@@ -1,6 +1,7 @@
 """The doctor's judgements on made-up machines."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -19,32 +20,13 @@ BROKEN = Probe(False, "", "RuntimeError: no such thing")
 @pytest.mark.parametrize(
     ("finding", "level"),
     [
-        (checks.judge_python((3, 12)), Level.OK),
-        (checks.judge_python((3, 11)), Level.FAIL),
-        (checks.judge_python((3, 13)), Level.OK),
-        (checks.judge_python((3, 14)), Level.WARN),
-        (checks.judge_bytecode(kept=True, compiled=False, folder="/site"), Level.OK),
-        (checks.judge_bytecode(kept=False, compiled=True, folder="/site"), Level.OK),
-        (checks.judge_bytecode(kept=False, compiled=False, folder="/site"), Level.WARN),
-        (checks.judge_name(["numpy", "lerobot_env_constructskill"]), Level.OK),
-        (checks.judge_name(["lerobot-env-constructskill"]), Level.FAIL),
-        (checks.judge_name([]), Level.FAIL),
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1", "sapien": "3.0.3"}), Level.OK),
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.6.1"}), Level.WARN),
         (checks.judge_versions(REQUIREMENTS, {"lerobot": "0.7.0", "sapien": "3.0.3"}), Level.FAIL),
         (checks.judge_versions(REQUIREMENTS, {"sapien": "3.0.3"}), Level.FAIL),
-        (checks.judge_lerobot("0.6.2"), Level.OK),
-        (checks.judge_lerobot("0.7.0"), Level.WARN),
-        (checks.judge_lerobot(None), Level.FAIL),
         (checks.judge_opencv({"opencv-python-headless": "4.12"}), Level.OK),
         (checks.judge_opencv(dict.fromkeys(checks.OPENCV, "4.12")), Level.WARN),
         (checks.judge_opencv({}), Level.FAIL),
-        (checks.judge_mesa("25.0.7-2~bpo12+1", gpu=False), Level.OK),
-        (checks.judge_mesa("24.3.0-1", gpu=False), Level.OK),
-        (checks.judge_mesa("22.3.6-1+deb12u2", gpu=False), Level.FAIL),
-        (checks.judge_mesa("24.2.8-1ubuntu1", gpu=False), Level.FAIL),
-        (checks.judge_mesa(None, gpu=False), Level.WARN),
-        (checks.judge_mesa("22.3.6", gpu=True), Level.OK),
         (checks.judge_vulkan(RENDERS, simulator=True), Level.OK),
         (checks.judge_vulkan(RENDERS, simulator=True, gpu=True), Level.WARN),
         (checks.judge_vulkan(Probe(True, "NVIDIA H100\tTrue", ""), simulator=True, gpu=True), Level.OK),
@@ -85,7 +67,6 @@ def test_complaints_name_their_cause() -> None:
     assert versions == "lerobot is 0.5 (needs <0.7,>=0.6.1); pip install 'lerobot[dataset]<0.7,>=0.6.1'."
     assert "no such thing" in checks.judge_vulkan(BROKEN, simulator=True).message
     assert "system is too old (found version 11040)); install" in checks.judge_cuda(OLD_DRIVER, gpu=True).message
-    assert "0.7.0 was not tried" in checks.judge_lerobot("0.7.0").message
     assert "install libpython3.13." in checks.judge_ffmpeg(Probe(False, "", "libpython3.13.so.1.0: not found")).message
     assert "none for b" in checks.judge_weights(Probe(True, "a\tHub\nb\t", "")).message
 
@@ -102,8 +83,7 @@ def test_a_check_has_one_name_whatever_it_finds() -> None:
 
 def test_the_pinned_lerobot_was_tried_and_so_says_the_page() -> None:
     pins, page = ((REPOSITORY / name).read_text() for name in ("constraints.txt", "docs/lerobot.md"))
-    assert any(f"\nlerobot=={version}\n" in pins for version in checks.LEROBOTS)
-    assert all(f"| {version} |" in page for version in checks.LEROBOTS)
+    assert f"| {re.search(r'^lerobot==(.*)$', pins, re.MULTILINE)[1]} |" in page
 
 
 @pytest.mark.parametrize(

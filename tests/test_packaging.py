@@ -18,7 +18,6 @@ from commands import call_inside
 from lerobot_constructskill import presets
 from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.scripts.config import show
-from lerobot_constructskill.scripts.front import main
 
 REPOSITORY = Path(__file__).parents[1]
 PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
@@ -95,19 +94,6 @@ for command, target in {scripts}.items():
 
 def test_help_does_not_wait_for_torch() -> None:
     run_python(HELP.format(scripts=PROJECT["scripts"]))
-
-
-def test_one_command_lists_the_others_and_starts_them() -> None:
-    def front(*arguments: str) -> tuple[int, str, str]:
-        return call_inside(main, "constructskill", *arguments)
-
-    _, listed, _ = front()
-    assert all(f"\n  {name.removeprefix('constructskill-')} " in listed for name in PROJECT["scripts"] if "-" in name)
-    assert front("--version")[1].startswith(f"constructskill {PROJECT['version']} (Python ")
-    assert front("config", "study/paper") == (0, f"{show('study/paper')}\n", "")
-    assert front("generate", "fsat")[2].startswith("constructskill-generate: There is no file and no")
-    status, _, unknown = front("genrate")
-    assert status == 1 and "'genrate'; the commands are: board, " in unknown
 
 
 @pytest.fixture(scope="module")

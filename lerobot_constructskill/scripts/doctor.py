@@ -3,29 +3,21 @@
 import shutil
 import subprocess
 import sys
-import sysconfig
 from collections.abc import Callable, Iterable
 from importlib import metadata
-from importlib.util import find_spec
-from pathlib import Path
 
 from lerobot_constructskill.errors import DISTRIBUTION, plural
-from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
+from lerobot_constructskill.scripts.console import EPILOG, Parser, edge, say
 from lerobot_constructskill.scripts.doctor_checks import (
     Finding,
     Level,
     Probe,
-    judge_bytecode,
     judge_cuda,
     judge_encoder,
     judge_fetched,
     judge_ffmpeg,
-    judge_lerobot,
-    judge_mesa,
-    judge_name,
     judge_opencv,
     judge_plugin,
-    judge_python,
     judge_versions,
     judge_vulkan,
     judge_weights,
@@ -125,23 +117,10 @@ def installed_versions() -> dict[str, str]:
     return {d.metadata["Name"]: d.version for d in metadata.distributions() if d.metadata["Name"]}
 
 
-def mesa_version() -> str | None:
-    if shutil.which("dpkg-query") is None:
-        return None
-    query = ["dpkg-query", "-W", "-f", "${Version}", "mesa-vulkan-drivers"]
-    return subprocess.run(query, capture_output=True, text=True, check=False).stdout or None
-
-
 def has_gpu() -> bool:
     if shutil.which("nvidia-smi") is None:
         return False
     return subprocess.run(["nvidia-smi", "-L"], capture_output=True, check=False).returncode == 0
-
-
-def check_bytecode() -> Finding:
-    package = find_spec("lerobot")
-    compiled = package is None or package.cached is None or Path(package.cached).exists()
-    return judge_bytecode(not sys.dont_write_bytecode, compiled, sysconfig.get_path("purelib"))
 
 
 def check_versions() -> Finding:
@@ -159,13 +138,8 @@ def check_vulkan() -> Finding:
 
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    lambda: judge_python(sys.version_info[:2]),
-    check_bytecode,
-    lambda: judge_name(list(installed_versions())),
     check_versions,
-    lambda: judge_lerobot(installed_versions().get("lerobot")),
     lambda: judge_opencv(installed_versions()),
-    lambda: judge_mesa(mesa_version(), has_gpu()),
     check_vulkan,
     lambda: judge_cuda(probe(CUDA), has_gpu()),
     lambda: judge_ffmpeg(probe(DECODE)),
@@ -188,16 +162,16 @@ def diagnose(checks: Iterable[Callable[[], Finding]] = CHECKS) -> int:
     for check in checks:
         finding = check()
         levels.append(finding.level)
-        print(f"{finding.level:<4}  {finding.name:<17}  {finding.message}", flush=True)
+        say(f"{finding.level:<4}  {finding.name:<17}  {finding.message}")
     failed, warned = levels.count(Level.FAIL), levels.count(Level.WARN)
-    print(f"{plural(len(levels), 'check')}, {failed} failed, {warned} warned.")
+    say(f"{plural(len(levels), 'check')}, {failed} failed, {warned} warned.")
     return int(failed > 0 or Level.OK not in levels)
 
 
 def main() -> None:
     parser = Parser(
         prog="constructskill-doctor",
-        description="Check Python, packages, Vulkan, FFmpeg, the LeRobot plugin, the pretrained weights "
+        description="Check packages, Vulkan, CUDA, FFmpeg, the LeRobot plugin, the pretrained weights "
         "and the encoder's speed on this machine (about a minute). Exit status 1 if one fails or none passes.",
         epilog=EPILOG,
     )

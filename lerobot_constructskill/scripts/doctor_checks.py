@@ -7,20 +7,12 @@ from enum import StrEnum
 
 from lerobot_constructskill.errors import DISTRIBUTION
 
-PYTHONS = ((3, 12), (3, 13))
-"""Those for which every pinned package has a wheel; setup.sh takes the same."""
-MESA_MINIMUM = (24, 3)
-"""The first Mesa whose lavapipe SAPIEN can use (it got VK_KHR_external_semaphore_fd)."""
-
-LEROBOTS = ("0.6.1", "0.6.2")
-"""Those on which this version was tried (docs/lerobot.md)."""
-
 DEMO_FRAMES = 5_381
 """What `constructskill-generate fast_shifted_wrist --episodes=50` makes."""
 
 REINSTALL = f"pip install --force-reinstall --no-deps '{DISTRIBUTION}', or the checkout's folder in its place"
 DRIVER = "install the driver's Vulkan part (in a container: NVIDIA_DRIVER_CAPABILITIES=all)"
-RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1 (Debian 12: from its backports; Ubuntu: 24.04 or newer)"
+RENDERER = "apt-get install mesa-vulkan-drivers libvulkan1, 24.3 or newer (Debian 12: its backports; Ubuntu 24.04)"
 
 OPENCV = (
     "opencv-python",
@@ -60,36 +52,6 @@ class Probe:
         return (self.out.splitlines() or [""])[-1]
 
 
-def judge_python(version: tuple[int, int]) -> Finding:
-    text = ".".join(map(str, version))
-    if version < PYTHONS[0]:
-        return Finding(Level.FAIL, "Python", f"{text}, but LeRobot needs 3.12: make an environment with Python 3.12.")
-    if version not in PYTHONS:
-        return Finding(Level.WARN, "Python", f"{text} is newer than 3.12 and 3.13, which were tested.")
-    return Finding(Level.OK, "Python", text)
-
-
-def judge_bytecode(kept: bool, compiled: bool, folder: str) -> Finding:
-    """Containers often forbid Python to keep what it compiles, and then every process waits for it again."""
-    if kept or compiled:
-        return Finding(Level.OK, "Compiled packages", "kept" if kept else "there")
-    remedy = f"unset PYTHONDONTWRITEBYTECODE, or run: python -m compileall -q '{folder}'."
-    return Finding(Level.WARN, "Compiled packages", f"every process compiles LeRobot and torch anew; {remedy}")
-
-
-def judge_name(names: Sequence[str]) -> Finding:
-    """LeRobot compares the raw `Name:`, so a build backend that writes hyphens hides the plugin."""
-    if DISTRIBUTION in names:
-        return Finding(Level.OK, "Distribution", DISTRIBUTION)
-    if DISTRIBUTION.replace("_", "-") in names:
-        return Finding(
-            Level.FAIL,
-            "Distribution",
-            f"its name has hyphens, so LeRobot does not find it; {REINSTALL}.",
-        )
-    return Finding(Level.FAIL, "Distribution", f"it is not installed; {REINSTALL}.")
-
-
 def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) -> Finding:
     """Compare installed versions with our own metadata; only packages of an extra may be absent."""
     from packaging.requirements import Requirement
@@ -119,16 +81,6 @@ def judge_versions(requirements: Sequence[str], installed: Mapping[str, str]) ->
     return Finding(Level.OK, "Versions", ", ".join(right))
 
 
-def judge_lerobot(version: str | None) -> Finding:
-    if version in LEROBOTS:
-        return Finding(Level.OK, "LeRobot", f"{version}, on which this package was tried")
-    tried, remedy = " and ".join(LEROBOTS), f"pip install lerobot=={LEROBOTS[0]}"
-    if version is None:
-        return Finding(Level.FAIL, "LeRobot", f"it is not installed; {remedy}.")
-    said = f"{version} was not tried with this package, {tried} were; if something fails, {remedy}."
-    return Finding(Level.WARN, "LeRobot", said)
-
-
 def judge_opencv(installed: Mapping[str, str]) -> Finding:
     """Compare the distributions with LeRobot's choice of one; ManiSkill's requirements bring a second."""
     found = sorted(set(OPENCV) & set(installed))
@@ -139,27 +91,6 @@ def judge_opencv(installed: Mapping[str, str]) -> Finding:
     if not found:
         return Finding(Level.FAIL, "OpenCV", f"none is installed; pip install {LEROBOTS_OPENCV}.")
     return Finding(Level.OK, "OpenCV", found[0])
-
-
-def judge_mesa(version: str | None, gpu: bool) -> Finding:
-    """Judge Debian's version of mesa-vulkan-drivers; None where it is not installed or not known."""
-    if gpu:
-        return Finding(Level.OK, "Mesa", "not needed where the NVIDIA GPU renders: see Vulkan")
-    wanted = ".".join(map(str, MESA_MINIMUM))
-    numbers = re.match(r"(?:\d+:)?(\d+)\.(\d+)", version or "")
-    if numbers is None:
-        return Finding(
-            Level.WARN,
-            "Mesa",
-            f"no Debian package mesa-vulkan-drivers; if Vulkan fails below, {RENDERER}, {wanted} or newer.",
-        )
-    if (int(numbers[1]), int(numbers[2])) < MESA_MINIMUM:
-        return Finding(
-            Level.FAIL,
-            "Mesa",
-            f"{version}, but SAPIEN can use lavapipe only from {wanted} on; {RENDERER}.",
-        )
-    return Finding(Level.OK, "Mesa", str(version))
 
 
 def judge_vulkan(probe: Probe, simulator: bool, gpu: bool = False) -> Finding:
