@@ -90,7 +90,7 @@ def tell(reference: str, path: Path) -> None:
         "compute": "physics alone, on a CPU",
         "observes": SEES.get(reference, "nothing"),
     }
-    path.write_text(yaml.safe_dump(about, sort_keys=False))
+    path.write_text(yaml.safe_dump(about, sort_keys=False), encoding="utf-8")
 
 
 def main(suite: str, reference: str, root: Path) -> None:

@@ -20,7 +20,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from itertools import repeat
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
@@ -184,13 +183,11 @@ def _complaint(value: Any, kind: Any) -> str | None:
         wrong = [complaint for item in value if (complaint := _complaint(item, *inner))] if _is_list(value) else ["it"]
         return f"a list, each {_wanted_of(*inner)}" if wrong else None
     if origin is dict:
-        right = isinstance(value, Mapping) and all(map(_fits, value.items(), repeat(inner)))
-        return None if right else "a mapping of names to values"
+        if not isinstance(value, Mapping):
+            return "a mapping of names to values"
+        wrong = [complaint for pair in value.items() for complaint in map(_complaint, pair, inner) if complaint]
+        return f"a mapping, with {wrong[0]} in place of what is there" if wrong else None
     return None if kind not in _TESTS or _TESTS[kind](value) else _NAMES[kind]
-
-
-def _fits(item: tuple[Any, Any], kinds: tuple[Any, Any]) -> bool:
-    return not any(map(_complaint, item, kinds))
 
 
 def _wanted_of(kind: Any) -> str:

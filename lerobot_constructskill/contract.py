@@ -74,8 +74,9 @@ SIM_STATE = {
 }
 """Privileged state, name to the names of its numbers: SI units, world frame."""
 
-DEMO_SEED_START = 1_000_000
-"""First seed of a data set. LeRobot's evaluations start at the training seed or at 1000."""
+DEMO_SEED_START, DEMO_SEED_STOP = 1_000_000, 2**30
+"""Between them lie the seeds of data sets. LeRobot's evaluations start at the training seed or at 1000, the board's at
+5000, and its re-runs have all from the second on."""
 
 HELD_OUT_EVERY = 8
 """One demonstration of so many is held out of training, the last of each group."""

@@ -4,11 +4,18 @@ A `UserError` is a sentence that says what is wrong with a request, a file or a 
 other exception that leaves the package is a defect of it, or an `OSError` of the operating system.
 """
 
+import os
 import re
-from collections.abc import Iterator
+import shlex
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from importlib.metadata import PackageNotFoundError, requires
+from pathlib import Path
 from traceback import TracebackException
+from types import TracebackType
 
 DISTRIBUTION = "lerobot_env_constructskill"
 
@@ -102,3 +109,48 @@ def full_traceback(error: BaseException) -> str:
         link.__suppress_context__ = False
         link = link.__cause__ or link.__context__
     return "".join(whole.format())
+
+
+def keep_traceback(command: Sequence[str], told: str) -> Path | None:
+    """Add a traceback to a command's log, or where the home folder cannot be written to a new one.
+
+    Returns:
+        The log; None where that fails as well.
+    """
+    name = Path(command[0]).stem
+    entry = f"{datetime.now():%Y-%m-%d %H:%M:%S}  {shlex.join(command)}\n{told}\n"
+    text = {"encoding": "utf-8", "errors": "backslashreplace"}  # a path need not be UTF-8
+    try:
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "constructskill"
+        folder.mkdir(parents=True, exist_ok=True)
+        log = folder / f"{name}.log"
+        with log.open("a", **text) as file:
+            file.write(entry)
+        return log
+    except (OSError, RuntimeError):  # Path.home raises the latter for a user who has none
+        pass
+    try:
+        with tempfile.NamedTemporaryFile("w", prefix=f"{name}-", suffix=".log", delete=False, **text) as file:
+            file.write(entry)
+        return Path(file.name)
+    except OSError:
+        return None
+
+
+def end_lerobots_commands_in_one_sentence() -> None:
+    """Have `lerobot-train` and its like say a `UserError` alone; the traceback is in the log, as of our commands.
+
+    Nothing else that they end in, and no other program, is touched.
+    """
+    others = sys.excepthook
+
+    def tell(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        name, first = Path(sys.argv[0]).name, error
+        while first.__cause__ is not None:  # draccus hands on what a configuration refuses in an exception of its own
+            first = first.__cause__
+        if not (isinstance(first, UserError) and name.startswith("lerobot-")):
+            return others(kind, error, trace)
+        log = keep_traceback(sys.argv, full_traceback(error))
+        print(f"{name}: {' '.join(str(first).split())} (traceback: {log})", file=sys.stderr)
+
+    sys.excepthook = tell

@@ -11,9 +11,10 @@ from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 from lerobot_constructskill.errors import MachineError
+from lerobot_constructskill.files import Json
 
 NAMES = {
     # Vector environments that stand still after an episode's end, as LeRobot's own benchmarks make them.
@@ -46,6 +47,55 @@ TRAIN_CONFIG = "train_config.json"
 """What a checkpoint of `lerobot-train` was trained with, beside its weights."""
 
 
+class _TrainingSet(TypedDict, total=False):
+    repo_id: str
+    root: str | None
+    revision: str | None
+    episodes: list[int] | None
+    eval_split: float | None
+
+
+class _Trained(TypedDict, total=False):
+    seed: int | None
+    dataset: _TrainingSet
+
+
+class _Metrics(TypedDict):
+    successes: list[bool]
+    max_rewards: list[float]
+
+
+class _Task(TypedDict):
+    task_group: str
+    task_id: int
+    metrics: _Metrics
+
+
+class _Evaluated(TypedDict):
+    per_task: list[_Task]
+
+
+class _Feature(TypedDict):
+    dtype: str
+    shape: list[int]
+    info: NotRequired[dict[str, Any] | None]
+
+
+class _Info(TypedDict):
+    features: dict[str, _Feature]
+    total_frames: NotRequired[int]
+    video_path: NotRequired[str | None]
+
+
+INFO = "meta/info.json"
+"""What makes a folder a data set of LeRobot's."""
+
+DATA_SET = Json("a LeRobot data set's description", _Info)
+TRAINED = Json("what lerobot-train writes", _Trained)
+EVALUATED = Json("what lerobot-eval writes", _Evaluated)
+"""What is read of LeRobot's own files."""
+
+
 def __getattr__(name: str) -> Any:
     if name not in NAMES:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
@@ -70,11 +120,6 @@ def _with_parents(module: str) -> list[str]:
 def load_plugins() -> None:
     """Import the installed LeRobot plugins, ours among them, once: they register policies and references."""
     __getattr__("register_third_party_plugins")()
-
-
-def largest_rewards(eval_info: dict[str, Any]) -> list[float]:
-    """The largest reward of every episode in an `eval_info.json` of `lerobot-eval`, over all tasks."""
-    return [reward for task in eval_info["per_task"] for reward in task["metrics"]["max_rewards"]]
 
 
 @contextmanager

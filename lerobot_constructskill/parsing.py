@@ -1,21 +1,23 @@
 """Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
 
 import argparse
-import json
 import os
 import shlex
-import tempfile
+import tomllib
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import draccus
-import yaml
+import mergedeep
 
 from lerobot_constructskill import tags
 from lerobot_constructskill.errors import FieldError, InputError
+from lerobot_constructskill.files import Json, parse_yaml, read_text
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find
 
@@ -30,17 +32,13 @@ def parse[Config](
 ) -> Config:
     """Read a configuration from flags, and from a YAML file that they are put over.
 
-    A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias.
-
     Raises:
         InputError: they do not make a configuration.
-        MissingError: a `!policy` in the file names no shipped policy.
-        OSError: the file cannot be opened.
+        MissingError: there is no such file, or a `!policy` in it names no shipped policy.
     """
     named, flags = _take_config_path(flags)
-    with as_input(), _plain(named or config_path) as file:
-        parser = ArgumentParser(config_class, file, exit_on_error=False, epilog=epilog)
-        return parser.parse_args([_readable(flag) for flag in flags])
+    with as_input():
+        return Parser(config_class, named or config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
 
 
 def parse_named[Config](config_class: type[Config], kind: str, text: str, flags: Sequence[str] = ()) -> Config:
@@ -69,31 +67,36 @@ def _take_config_path(flags: Sequence[str]) -> tuple[str | None, list[str]]:
     return taken.config_path, others
 
 
-@contextmanager
-def _plain(path: Path | str | None) -> Iterator[Path | str | None]:
-    """A configuration file as draccus can read it: without our tags. JSON and TOML have none."""
-    if path is None or Path(path).suffix in (".json", ".toml"):
-        yield path
-        return
-    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
-        yaml.safe_dump(tags.read(path), file, sort_keys=False, allow_unicode=True)
-        file.flush()
-        yield file.name
+class Parser(ArgumentParser):
+    """draccus' parser of flags, but their values and the file are read as `files.Loader` reads."""
+
+    def _postprocessing(self, flags: argparse.Namespace) -> Any:
+        said = draccus.utils.deflatten({name: _value(text) for name, text in vars(flags).items()}, sep=".")
+        return decode(self.config_class, mergedeep.merge(_fields(self.config_path), said))
 
 
-def _readable(flag: str) -> str:
-    """A flag whose value YAML can read: in quotation marks where it cannot.
+def _value(text: str) -> Any:
+    """A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias.
 
     `~/` is the home folder; a shell does not replace it behind an equals sign.
     """
-    name, _, value = flag.partition("=")
-    if value.startswith("~/"):
-        flag = f"{name}={(value := os.path.expanduser(value))}"
+    text = os.path.expanduser(text) if text.startswith("~/") else text
     try:
-        yaml.compose(value, Loader=yaml.SafeLoader)
-    except yaml.YAMLError:
-        return f"{name}={json.dumps(value)}"
-    return flag
+        return parse_yaml(text, "It") if text else text
+    except InputError:
+        return text
+
+
+def _fields(path: Path | str | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    suffix = Path(path).suffix
+    if suffix == ".toml":
+        return tomllib.loads(read_text(Path(path)))
+    fields = Json("a configuration").read(Path(path)) if suffix == ".json" else tags.read(path)
+    if not isinstance(fields, dict):
+        raise InputError("The configuration's file is empty or is not a mapping of fields.")
+    return fields
 
 
 def tells_of_bases[Config](config_class: type[Config]) -> type[Config]:
@@ -110,7 +113,32 @@ def decode[Config](config_class: type[Config], fields: Mapping[str, Any]) -> Con
         InputError: they do not make one.
     """
     with as_input():
+        _refuse_truths(config_class, fields)
         return draccus.decode(config_class, fields)
+
+
+def _refuse_truths(kind: Any, value: Any, name: str = "") -> None:
+    """Refuse true and false where a number belongs; draccus takes them for 1 and 0."""
+    kinds = [*_alternatives(kind)]
+    if isinstance(value, bool) and {int, float} & {*kinds} and not {bool, str, Any} & {*kinds}:
+        raise InputError(f"{name} must be a number, not {str(value).lower()}.")
+    for one in kinds:
+        of = get_args(one) or (Any,)
+        if isinstance(value, Mapping) and is_dataclass(one):
+            hints = get_type_hints(one)
+            inner = [(hints[field], each, field) for field, each in value.items() if field in hints]
+        elif isinstance(value, Mapping):
+            inner = [(of[-1], each, field) for field, each in value.items()]
+        else:
+            inner = [(of[0], each, "") for each in value] if isinstance(value, list) else []
+        for kind_of, each, field in inner:
+            _refuse_truths(kind_of, each, ".".join(filter(None, (name, str(field)))))
+
+
+def _alternatives(kind: Any) -> Iterable[Any]:
+    if get_origin(kind) in (Union, UnionType):
+        return (one for each in get_args(kind) for one in _alternatives(each))
+    return (kind,)
 
 
 @contextmanager

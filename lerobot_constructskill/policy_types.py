@@ -11,8 +11,11 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.utils import auto_select_torch_device
 
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import as_input, decode
+
+CONFIGURATION = Json("a policy's configuration")
 
 
 def decode_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
@@ -39,6 +42,8 @@ def read_policy(checkpoint: Path | str, **overrides: Any) -> PreTrainedConfig:
     """
     load_plugins()
     flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
+    if (file := Path(checkpoint) / "config.json").exists():
+        CONFIGURATION.read(file)
     with as_input():
         try:
             return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)

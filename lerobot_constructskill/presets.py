@@ -49,5 +49,5 @@ def _listed(kind: str) -> str:
 
 def description(path: Path) -> str:
     """The first sentence of the comment that a configuration opens with."""
-    comment = re.match(r"(#.*\n)*", path.read_text())[0]
+    comment = re.match(r"(#.*\n)*", path.read_text(encoding="utf-8"))[0]
     return re.split(r"(?<=[.?!]) ", " ".join(comment.replace("#", "").split()), maxsplit=1)[0]

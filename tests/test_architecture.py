@@ -14,11 +14,12 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 SIMULATOR = {"sapien", "mani_skill", "mplib"}
 
 # What a room, or a file with a row of its own, may import of ours, a room or a file of one; its own room and
-# these four go without saying.
-EVERYWHERE = ("bounds", "errors", "lerobot_internals", "progress")
+# these five go without saying.
+EVERYWHERE = ("bounds", "errors", "files", "lerobot_internals", "progress")
 ARROWS = {
     "bounds": (),
     "errors": (),
+    "files": (),
     "lerobot_internals": (),
     "progress": (),
     "presets": (),
@@ -80,7 +81,7 @@ ARROWS = {
     "board.site": ("analysis.report.wording", "artifacts", "contract"),
     "analysis": (),
     "analysis.stats": ("study.rows",),
-    "analysis.report": ("study.rows",),
+    "analysis.report": ("artifacts", "study.rows"),
     "comparison": ("analysis.stats", "contract", "envs.recording", "perturbations", "study.rows"),
     "comparison.evaluate": ("artifacts", "contract", "envs.recording", "rollout", "training"),
     "scripts": (
@@ -113,6 +114,7 @@ LAZY_ARROWS = {"envs": ("sim",)}
 EXTERNALS = {
     "bounds": {"torch"},
     "errors": set(),
+    "files": {"pyarrow", "pydantic", "yaml"},
     "lerobot_internals": set(),
     "progress": {"av", "tqdm"},
     "other_tasks": set(),

@@ -20,7 +20,7 @@ from lerobot_constructskill.scripts import console
 from lerobot_constructskill.scripts.film import FilmConfig
 
 SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
-BARE = {"constructskill", "constructskill-doctor", "constructskill-config"}
+BARE = {"constructskill-doctor", "constructskill-config"}
 """Commands without a configuration."""
 
 NEEDED = {

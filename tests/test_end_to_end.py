@@ -140,7 +140,8 @@ def test_a_truncated_checkpoint_is_named_in_one_sentence(trained, folder):
     weights.write_bytes(weights.read_bytes()[:1000])
     log = call("lerobot-eval", f"--policy.path={checkpoint}", *ENV, f"--output_dir={folder / 'none'}", fails=True)
     last = log.strip().splitlines()[-1]
-    assert "model.safetensors" in last and "truncated" in last
+    assert last.startswith("lerobot-eval: ") and "model.safetensors" in last and "truncated" in last
+    assert "Traceback" not in log
 
 
 def test_features_of_another_encoder_are_refused_in_one_sentence(features, folder):
@@ -148,6 +149,7 @@ def test_features_of_another_encoder_are_refused_in_one_sentence(features, folde
     log = call("lerobot-train", *flags, "--steps=2", f"--output_dir={folder / 'refused'}", fails=True)
     last = log.strip().splitlines()[-1]
     assert "were not made by this policy's encoder: preprocessing" in last and "crop [0.0, 0.0, 0.5, 1.0]" in last
+    assert last.startswith("lerobot-train: ") and "Traceback" not in log
 
 
 def test_lerobots_own_tools_read_the_data_set(demonstrations):

@@ -31,7 +31,6 @@ REPOSITORY = Path(__file__).parents[1]
 MODULES = sorted((REPOSITORY / "lerobot_constructskill").rglob("*.py"))
 PYTHONS = {"ValueError", "OSError", "FileNotFoundError", "FileExistsError"}
 SCRIPTS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]["scripts"]
-COMMANDS = {name: target for name, target in SCRIPTS.items() if "-" in name}  # `constructskill` starts one of them
 
 Run = Callable[..., tuple[int, str]]
 
@@ -60,7 +59,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     return call
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", SCRIPTS)
 def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, run: Run, tmp_path: Path) -> None:
     status, printed = run(command, "--debug", error=KeyError("a b"))
     log = tmp_path / "constructskill" / f"{command}.log"
@@ -77,22 +76,13 @@ def test_without_debug_a_fault_is_one_sentence(run: Run, tmp_path: Path) -> None
     assert (tmp_path / "constructskill" / "constructskill-report.log").read_text().count("Traceback") == 2
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", SCRIPTS)
 def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) -> None:
     """Of the command that is installed: the one true process for each."""
     call = [Path(sys.executable).parent / command, "--no_such_flag=3"]
     done = subprocess.run(call, capture_output=True, text=True, env={"XDG_STATE_HOME": str(tmp_path)})
     assert done.returncode == 1 and done.stderr == f"{command}: unrecognized arguments: --no_such_flag=3\n"
     assert "InputError" in (tmp_path / "constructskill" / f"{command}.log").read_text()
-
-
-@pytest.mark.parametrize(
-    "call", [["doctor", "--weights=true"], ["config", "one", "two"], ["report", "--nothing"]], ids=lambda call: call[0]
-)
-def test_a_command_behind_the_overview_is_told_to_print_its_traceback(call: list[str], run: Run) -> None:
-    status, printed = run("constructskill", *call, "--debug")
-    assert status == 1 and "Traceback" in printed and "InputError: " in printed
-    assert printed.splitlines()[-1].startswith(f"constructskill-{call[0]}: ")
 
 
 @pytest.mark.parametrize(
@@ -119,6 +109,46 @@ def test_a_reader_who_has_read_enough_is_no_fault(tmp_path: Path) -> None:
         text=True,
     )
     assert done.returncode == 0 and not done.stderr and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", SCRIPTS)
+def test_a_path_that_is_no_text_is_one_sentence(command: str, run: Run, tmp_path: Path) -> None:
+    """Linux knows bytes, and hands each that is no UTF-8 to Python as half of a character."""
+    status, printed = run(command, "--config_path=\udcff", "--no_such_flag=\udcff")
+    assert status == 1 and len(printed.splitlines()) == 1
+    assert "\\udcff" in (tmp_path / "constructskill" / f"{command}.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("closed", "status", "said"),
+    [
+        ("1>&-", 0, ""),
+        ("2>&-", 0, ""),
+        ("1>&- 2>&- <&-", 0, ""),
+        (
+            ">/dev/full",
+            1,
+            "constructskill-config: standard output cannot be written to (No space left on device); what was asked "
+            "for is done\n",
+        ),
+    ],
+)
+def test_nobody_who_listens_is_no_fault(closed: str, status: int, said: str, tmp_path: Path) -> None:
+    command = f"{Path(sys.executable).parent}/constructskill-config {closed}"
+    environment = {"XDG_STATE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True)
+    assert done.returncode == status and done.stderr == said
+
+
+def test_a_locale_without_letters_is_no_fault(tmp_path: Path) -> None:
+    """What is said is escaped, and what is written is UTF-8."""
+    named = tmp_path / "é.yaml"
+    named.write_text("repo_id: a/b\nroot: é\nepisodes: 0\n", encoding="utf-8")
+    locale = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "XDG_STATE_HOME": str(tmp_path)}
+    command = [Path(sys.executable).parent / "constructskill-generate", named]
+    done = subprocess.run(command, env=locale, capture_output=True, text=True)
+    assert done.returncode == 1 and "episodes must be" in done.stderr and len(done.stderr.splitlines()) == 1
+    assert "udcc3" in (tmp_path / "constructskill" / "constructskill-generate.log").read_text(encoding="utf-8")
 
 
 def test_a_log_finds_its_place_where_the_home_folder_cannot_be_written(run: Run, tmp_path: Path) -> None:

@@ -23,3 +23,10 @@ def test_the_reason_is_the_last_line(command: tuple[str, ...], flag: str, said: 
     monkeypatch.chdir(tmp_path)
     assert said in call(*command, flag, fails=True).strip().splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+def test_a_program_of_ones_own_ends_with_its_traceback(tmp_path, monkeypatch) -> None:
+    """One wants to know where."""
+    monkeypatch.chdir(tmp_path)
+    code = "import lerobot_constructskill.plugin as plugin; plugin.ConstructSkillEnvConfig(task='none')"
+    assert "Traceback" in call("code", code, fails=True)

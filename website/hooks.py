@@ -110,7 +110,7 @@ def source_page(path: Path) -> str:
 
 
 def block(path: Path) -> str:
-    return f"## {path.relative_to(ROOT)}\n\n```{LANGUAGES.get(path.suffix, '')}\n{path.read_text()}```"
+    return f"## {path.relative_to(ROOT)}\n\n```{LANGUAGES.get(path.suffix, '')}\n{path.read_text(encoding='utf-8')}```"
 
 
 def is_text(path: Path) -> bool:

@@ -117,7 +117,7 @@ def success(base: str) -> str:
 @cache
 def docstring(module: str, name: str) -> str:
     """A class's docstring, without the simulator that its module imports."""
-    tree = ast.parse(Path(find_spec(module).origin).read_text())
+    tree = ast.parse(Path(find_spec(module).origin).read_text(encoding="utf-8"))
     return next(ast.get_docstring(node) for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
 
 

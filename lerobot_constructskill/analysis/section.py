@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Annotated
 
-from lerobot_constructskill.bounds import Range, check
+from lerobot_constructskill.bounds import Range, Text, check
 from lerobot_constructskill.errors import InputError
 
 Level = Annotated[float, Range(above=0, most=0.5)]
@@ -30,7 +30,7 @@ class Analysis:
         InputError: no such tests can be made.
     """
 
-    labels: dict[str, str] = field(default_factory=dict)
+    labels: dict[str, Text] = field(default_factory=dict)
     order: list[str] = field(default_factory=list)
     comparisons: list[list[str]] | None = None
     alpha: Level = 0.05

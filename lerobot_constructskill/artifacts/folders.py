@@ -1,13 +1,14 @@
 """Folders and files that appear whole or not at all, however a process that writes one ends. Standard library only."""
 
 import os
-import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
+from secrets import token_hex
 
+from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.errors import TakenError
 
@@ -26,7 +27,8 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
             and is there again for the next one, until `root` is whole.
 
     Raises:
-        FileExistsError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
+        TakenError: `root` exists, another process is writing it, or `<root>.partial` is not ours.
+        MachineError: the disk is full.
     """
     root = root.absolute()  # of '.', the name beside which the parts lie is not known
     exists = f"The output folder {root} exists already; remove it or name another."
@@ -43,9 +45,10 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
             if root.exists():  # by now
                 raise TakenError(exists)
             _clear(partial, keep)
-            yield folder
-            _open_up(folder)
-            folder.rename(root)
+            with room_for(root):
+                yield folder
+                _open_up(folder)
+                folder.rename(root)
         finally:
             _clear(partial, None if root.exists() else keep)
             if not any(path.name != MARK for path in partial.iterdir()):
@@ -75,7 +78,7 @@ def sweep(root: Path) -> None:
 
 
 def _partial(root: Path) -> Path:
-    return root.with_name(root.name + ".partial")
+    return root.parent / f"{root.name}.partial"  # of '/', which exists, the name is empty
 
 
 def _clear(partial: Path, keep: str | None = None) -> None:
@@ -89,31 +92,31 @@ def _clear(partial: Path, keep: str | None = None) -> None:
             path.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a file of text, which appears whole or not at all. Raises as `replaced` does."""
+    with replaced(path) as partial:
+        partial.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a path beside `path` to write a file to; it becomes `path` when the block ends, whole or not at all.
 
-    What killed processes of this machine left of the same file is removed.
+    What killed processes left of the same file is removed: whoever writes one holds it locked, on any machine.
+
+    Raises:
+        MachineError: the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    host = platform.node()
-    partial = path.with_name(f".{host}-{os.getpid()}.{path.name}")  # its ending stays, for those that write by it
-    for other in path.parent.glob(f".{escape(host)}-*.{escape(path.name)}"):
-        if not _is_alive(other.name.removeprefix(f".{host}-").removesuffix(f".{path.name}")):
+    for other in path.parent.glob(f".partial-*.{escape(path.name)}"):
+        with suppress(TakenError), locked(other, taken="It is in use."):
             other.unlink(missing_ok=True)
-    try:
-        yield partial
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _is_alive(process: str) -> bool:
-    """Whether a number is that of a process of this machine; what is no number is somebody else's."""
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OSError):
-        return True
-    return True
+    # Its ending stays, for those that write by it.
+    partial = path.with_name(f".partial-{token_hex(8)}.{path.name}")
+    with locked(partial):
+        try:
+            with room_for(path):
+                yield partial
+            os.replace(partial, path)
+        finally:
+            partial.unlink(missing_ok=True)

@@ -31,7 +31,7 @@ def _lock(path: Path, taken: str | None) -> TextIO | None:
     """The file, open and locked; None where the process that held it has removed it meanwhile."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileNotFoundError), ExitStack() as stack:
-        lock = stack.enter_context(path.open("a"))
+        lock = stack.enter_context(path.open("a", encoding="utf-8"))
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | (fcntl.LOCK_NB if taken else 0))
         except BlockingIOError:

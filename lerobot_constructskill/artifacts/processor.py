@@ -29,6 +29,6 @@ def make() -> str:
 
 def _facts() -> dict[str, str]:
     """What Linux says of the first core."""
-    first = CPUINFO.read_text().partition("\n\n")[0] if CPUINFO.exists() else ""
+    first = CPUINFO.read_text(encoding="utf-8").partition("\n\n")[0] if CPUINFO.exists() else ""
     pairs = (line.split(":", 1) for line in first.splitlines() if ":" in line)
     return {name.strip(): value.strip() for name, value in pairs}

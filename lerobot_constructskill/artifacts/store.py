@@ -1,4 +1,4 @@
-"""Everything made is found by what made it: a specification, its digest, a folder. Standard library only.
+"""Everything made is found by what made it: a specification, its digest, a folder.
 
     <store>/<kind>/<digest>/spec.json   beside whatever the artefact holds, log.txt among it where something was said
     <store>/logs/<kind>-<digest>.txt    the same log while the artefact is in the making, and after a failure
@@ -15,14 +15,23 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from lerobot_constructskill.artifacts.digests import digest
 from lerobot_constructskill.artifacts.folders import staged, sweep
 from lerobot_constructskill.artifacts.locks import locked
-from lerobot_constructskill.errors import InputError, TakenError, full_traceback
+from lerobot_constructskill.errors import InputError, MissingError, TakenError, full_traceback
+from lerobot_constructskill.files import Json
+
+
+class _Spec(TypedDict, total=False):
+    seed: int
+    training: dict[str, Any]
+
 
 SPEC, LOG = "spec.json", "log.txt"
+
+SPECIFICATION = Json("the specification of what a store keeps", _Spec)
 
 logger = logging.getLogger(__name__)
 
@@ -99,7 +108,7 @@ class Store:
             log = self.log(artifact)
             if log.exists():
                 shutil.copy(log, folder / LOG)
-            (folder / SPEC).write_text(json.dumps(artifact.spec, indent=2, sort_keys=True) + "\n")
+            (folder / SPEC).write_text(json.dumps(artifact.spec, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         log.unlink(missing_ok=True)
 
     def log(self, artifact: Artifact) -> Path:
@@ -110,7 +119,7 @@ class Store:
         """Add an exception's whole traceback to the log."""
         log = self.log(artifact)
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("a") as file:
+        with log.open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{full_traceback(error)}\n")
 
     def discard(self, artifact: Artifact) -> None:
@@ -131,6 +140,6 @@ class Store:
 
 def _read_spec(path: Path) -> Any:
     try:
-        return json.loads(path.read_text())
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return SPECIFICATION.read(path)
+    except (MissingError, InputError):
         return None

@@ -1,13 +1,70 @@
-"""Tables of an earlier version, read with the columns of this one."""
+"""Parquet files of one kind, whose columns are the fields of a dataclass."""
 
-from collections.abc import Collection
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from types import NoneType
+from typing import Any, get_args
 
 import pyarrow as pa
 
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Json, read_parquet
 
-def with_later_columns(table: pa.Table, schema: pa.Schema, later: Collection[str]) -> pa.Table:
-    """`table` with null in those columns of `schema` that it lacks and that `later` versions brought."""
-    for index, field in enumerate(schema):
-        if field.name in later and field.name not in table.column_names:
-            table = table.add_column(min(index, table.num_columns), field, pa.nulls(len(table), field.type))
-    return table
+MOST = 256 << 20
+"""Bytes of a table of one kind, unpacked."""
+
+VERSIONS = Json("versions, package to version", dict[str, str])
+
+_ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+
+
+@dataclass(frozen=True)
+class Table:
+    """Parquet files whose columns are a dataclass' fields, of which those that may be None may be null.
+
+    Args:
+        what: what such a file is called, with its article.
+        kind: the dataclass.
+        types: of its fields that are no str, int, float or bool.
+        later: columns that earlier versions did not have; they are read as null.
+        json: columns that hold JSON.
+    """
+
+    what: str
+    kind: type
+    types: Mapping[Any, pa.DataType] = field(default_factory=dict)
+    later: Sequence[str] = ()
+    json: Mapping[str, Json] = field(default_factory=dict)
+
+    @cached_property
+    def schema(self) -> pa.Schema:
+        return pa.schema([(one.name, self._type(one.type)) for one in fields(self.kind)])
+
+    def _type(self, annotation: Any) -> pa.DataType:
+        kinds = _ARROW | dict(self.types)
+        return next(kinds[kind] for kind in (annotation, *get_args(annotation)) if kind in kinds)
+
+    def read(self, path: Path) -> pa.Table:
+        """A file's rows, of which there is one at least.
+
+        Raises:
+            MissingError: there is no such file.
+            InputError: it is of another kind, or a value is missing.
+        """
+        table = read_parquet(path, most=MOST)
+        for index, one in enumerate(self.schema):
+            if one.name in self.later and one.name not in table.column_names:
+                table = table.add_column(min(index, table.num_columns), one, pa.nulls(len(table), one.type))
+        if not table.schema.equals(self.schema):
+            raise InputError(f"'{path}' is not {self.what} of this version.")
+        if not len(table):
+            raise InputError(f"'{path}' is not {self.what}: it has no rows.")
+        for one in fields(self.kind):
+            if table[one.name].null_count and NoneType not in get_args(one.type):
+                raise InputError(f"'{path}' is not {self.what}: {one.name} is missing in a row.")
+        for name, kind in self.json.items():
+            for text in table[name].unique().drop_null().to_pylist():
+                kind.parse(text, f"{name} in '{path}'")
+        return table

@@ -5,13 +5,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-import yaml
-
 from lerobot_constructskill.board.protocol import Setting, where
 from lerobot_constructskill.board.submission import About, Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_environments, read_rows
 
 SEED = r"seed_(\d{1,9})"
 
@@ -65,7 +63,7 @@ def of_study(
     own = rows[rows["variant"] == variant]
     if own.empty:
         raise InputError(f"The study has no variant '{variant}'; it has: {', '.join(rows['variant'].unique())}.")
-    own = own[own["setting"].isin(_alike(root / STUDY, variant, own["setting"].unique(), settings, chosen))]
+    own = own[own["setting"].isin(_alike(root, variant, own["setting"].unique(), settings, chosen))]
     piles: Piles = {}
     failures: Failures = {}
     for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
@@ -87,10 +85,10 @@ def of_study(
 
 
 def _alike(
-    path: Path, variant: str, ran: Iterable[str], settings: Mapping[str, Setting], chosen: Sequence[str] | None
+    root: Path, variant: str, ran: Iterable[str], settings: Mapping[str, Setting], chosen: Sequence[str] | None
 ) -> list[str]:
     """Those settings of a study, among those that a variant `ran` in, that evaluate where one of `settings` does."""
-    study = _environments(path)
+    study = _environments(root)
     if unknown := [name for name in chosen or () if name not in study]:
         raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(study)}.")
     asked = [setting.where for setting in settings.values()]
@@ -111,17 +109,12 @@ def _alike(
     return [name for (name,) in alike.values()]
 
 
-def _environments(path: Path) -> dict[str, tuple[str, int, str]]:
+def _environments(root: Path) -> dict[str, tuple[str, int, str]]:
     """Where each of a study's settings evaluates, as `Setting.where`."""
-    try:
-        settings = yaml.safe_load(path.read_text())["settings"]
-        envs = {name: of["env"] for name, of in settings.items()}
-        return {
-            name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
-            for name, env in envs.items()
-        }
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
-        raise InputError(f"'{path}' is not a study's file, or a setting in it does not say env.task.") from None
+    return {
+        name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
+        for name, env in read_environments(root).items()
+    }
 
 
 def _told(places: Iterable[tuple[str, int, str]]) -> str:

@@ -1,11 +1,11 @@
 """The board's entries: submissions, what is known of each, and what their seeds reached in every setting."""
 
-import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 
@@ -22,6 +22,21 @@ from lerobot_constructskill.board.submission import (
 )
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.files import Json
+
+
+class Verdict(TypedDict):
+    """What a file in `VERIFIED` holds: of which submission, how far and when it was verified, with what, and where."""
+
+    submission: str
+    level: Literal[LEVELS]
+    date: str
+    versions: dict[str, str]
+    machines: NotRequired[list[str]]  # before 2026-11-24 none was named
+    rerun: NotRequired[dict[str, Any]]
+
+
+VERDICT = Json("a verdict of constructskill-verify", Verdict)
 
 ENTRIES, VERIFIED = "entries", "verified"
 """Folders of a board: what strangers submit, and what its keepers found when they verified it."""
@@ -94,26 +109,32 @@ class Entry:
         return Standing(claims, placed, lifted, sum(one.error is not None for own in claims.values() for one in own))
 
 
-def read_entries(root: Path) -> list[Entry]:
-    """Every entry of a board's folder, by name.
+class Read(NamedTuple):
+    """What was read of a board: its entries by name, and of each that cannot be read a sentence that names it."""
 
-    Raises:
-        MissingError: there is no such folder.
-        InputError: an entry is no submission; the message names it.
-    """
+    entries: list[Entry]
+    refused: list[str]
+
+
+def read_entries(root: Path) -> Read:
+    """Every entry of a board's folder. Raises MissingError where there is no such folder."""
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
     # What ends in .partial is being written, or was when its process was killed.
-    return [_entry(root, path) for path in sorted((root / ENTRIES).iterdir()) if path.suffix != ".partial"]
+    read = Read([], [])
+    for path in sorted((root / ENTRIES).iterdir()):
+        if path.suffix != ".partial":
+            try:
+                read.entries.append(_entry(root, path))
+            except (InputError, MissingError) as error:
+                read.refused.append(f"Entry {path.name!a}: {error}")
+    return read
 
 
 def _entry(root: Path, path: Path) -> Entry:
     if not NAME.allows(path.name):
-        raise InputError(f"The folder of an entry must be called by {NAME.meaning}, not {path.name!a}.")
-    try:
-        submission = read_submission(path)
-    except (InputError, MissingError) as error:
-        raise type(error)(f"Entry '{path.name}': {error}") from error
+        raise InputError(f"the folder of an entry must be called by {NAME.meaning}.")
+    submission = read_submission(path)
     verdict = read_verdict(root / VERIFIED / f"{path.name}.json", {"submission": submission.sha256})
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
 
@@ -124,16 +145,9 @@ def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         InputError: the file is no verdict.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return {}
-    try:
-        verdict = {"machines": []} | json.loads(path.read_text())  # before 2026-11-24 none was named
-        known = verdict["level"] in LEVELS and isinstance(verdict["versions"], dict)
-        known = known and isinstance(verdict["machines"], list) and isinstance(verdict["date"], str)
-    except (ValueError, KeyError, TypeError):
-        known = False
-    if not known:
-        raise InputError(f"'{path}' is not a verdict of constructskill-verify.")
+    verdict = {"machines": []} | VERDICT.read(path)
     return verdict if all(verdict.get(name) == value for name, value in of.items()) else {}
 
 

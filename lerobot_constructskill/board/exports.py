@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.folders import replaced, write_text
 from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
 from lerobot_constructskill.board.submission import Claim
@@ -162,5 +162,4 @@ def _withdraw(folder: Path) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    with replaced(path) as partial:
-        partial.write_text(text.rstrip() + "\n")
+    write_text(path, text.rstrip() + "\n")

@@ -6,8 +6,8 @@ from hashlib import sha256
 from typing import Annotated
 
 from lerobot_constructskill.bounds import Range, Seed, check
+from lerobot_constructskill.contract import DEMO_SEED_STOP, get_task
 from lerobot_constructskill.contract import SUITES as TASKS_OF
-from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import AXES, Perturbation
 
@@ -52,8 +52,8 @@ checkpoint does as well on starts that nobody could know when it was submitted."
 STANDARD, CUSTOM = CLASSES = ("standard", "custom")
 """A submission with exactly the settings of its suite and training seeds of the protocol, and any other."""
 
-FIRST_FRESH = 2**30
-"""Starts of re-runs lie from here on: above those of demonstrations (1,000,000 on) and of every protocol."""
+FIRST_FRESH = DEMO_SEED_STOP
+"""Starts of re-runs lie from here on: above those of demonstrations and of every protocol."""
 
 
 @dataclass(frozen=True)

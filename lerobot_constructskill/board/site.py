@@ -8,13 +8,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from lerobot_constructskill.analysis.report.wording import percent, share_range
-from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.films import films_there, write_films
 from lerobot_constructskill.board.protocol import CLASSES, LEVELS, RANKED_FROM, SUITES
 from lerobot_constructskill.contract import STAGES
-from lerobot_constructskill.errors import plural
+from lerobot_constructskill.errors import InputError, plural
 
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = Path(__file__).parents[1] / "analysis" / "report" / "templates"
@@ -36,19 +36,21 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
 
     Raises:
         MissingError: there is no board.
-        InputError: an entry is no submission.
+        InputError: entries cannot be read; the board is there without them.
         OSError: there is nothing to render films with.
     """
-    entries = read_entries(root)
+    entries, refused = read_entries(root)
     if films:
         write_films(entries, out)
     day = datetime.now(UTC).date().isoformat()
     pages = {f"{suite}.html": _suite_page(suite, entries, out, day) for suite in SUITES}
     pages["index.html"] = _render("index.html", entries=entries, suites=SUITES, day=day)
     for name, text in pages.items():
-        with replaced(out / name) as partial:
-            partial.write_text(text)
+        write_text(out / name, text)
     write_exports(entries, out, day, dataset_id)
+    if refused:
+        more = f" And {len(refused) - 1} more." if len(refused) > 1 else ""
+        raise InputError(f"The board in {out} is without what cannot be read. {refused[0]}{more}")
     return [out / name for name in pages]
 
 

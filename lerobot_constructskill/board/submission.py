@@ -19,12 +19,13 @@ import yaml
 
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.board.protocol import PHYSICS, SUITES, Setting, class_of
-from lerobot_constructskill.board.strangers import bounded_memory, make, read_files, read_yaml
+from lerobot_constructskill.board.strangers import Plain, read_files
 from lerobot_constructskill.bounds import UNSEEN, Among, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import OBS_TYPES, STAGES, TASKS, get_task
 from lerobot_constructskill.envs.actions import within_reach
 from lerobot_constructskill.envs.recording import ACTIONS, Outcome, compressed
 from lerobot_constructskill.errors import InputError, first_line, plural
+from lerobot_constructskill.files import Yaml, bounded_memory, to_text
 
 DECLARATION, EPISODES = "submission.yaml", "episodes.parquet"
 
@@ -164,6 +165,11 @@ class Declaration:
                 yield name, seed, start
 
 
+ABOUT = Yaml("what is said of a policy", About, Plain)
+SETTINGS = Yaml("a list of settings", dict[str, Setting], Plain)
+DECLARED = Yaml("the declaration of a submission", Declaration, Plain)
+
+
 def check_line(value: str, where: str) -> None:
     if not LINE.allows(value):
         raise InputError(f"{where} must be lines of text, not {value[:100]!a}.")
@@ -246,7 +252,9 @@ def write_submission(root: Path, claims: Iterable[Claim], **declared: Any) -> Su
         pq.write_table(table, folder / EPISODES, **compressed("actions"))
         hashed = hashlib.sha256((folder / EPISODES).read_bytes()).hexdigest()
         plain = asdict(replace(unhashed, episodes_sha256=hashed))
-        (folder / DECLARATION).write_text(yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=119))
+        (folder / DECLARATION).write_text(
+            yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=119), encoding="utf-8"
+        )
         submission = read_submission(folder)
     return submission
 
@@ -259,7 +267,7 @@ def read_submission(root: Path) -> Submission:
         InputError: it is not what a submission is; the message says where.
     """
     content = read_files(root, MOST)
-    declaration = _declaration(read_yaml(content[DECLARATION], DECLARATION))
+    declaration = DECLARED.parse(to_text(content[DECLARATION], DECLARATION), DECLARATION)
     if hashlib.sha256(content[EPISODES]).hexdigest() != declaration.episodes_sha256:
         raise InputError(f"{EPISODES} is not the file that {DECLARATION} was written with: its hash differs.")
     claims = _claims(_table(content[EPISODES], declaration))
@@ -268,17 +276,6 @@ def read_submission(root: Path) -> Submission:
         _check(claim, declaration.settings[claim.setting])
     _check_copies(declaration, claims)
     return Submission(declaration, claims, hashlib.sha256(content[DECLARATION]).hexdigest())
-
-
-def _declaration(said: Any) -> Declaration:
-    if isinstance(said, dict):
-        said = dict(said)
-        if "about" in said:
-            said["about"] = make(About, said["about"], "about")
-        if isinstance(said.get("settings"), dict):
-            each = said["settings"].items()
-            said["settings"] = {name: make(Setting, of, f"settings.{name!a:.60}") for name, of in each}
-    return make(Declaration, said, DECLARATION)
 
 
 def _table(content: bytes, declaration: Declaration) -> pa.Table:

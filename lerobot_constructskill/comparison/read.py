@@ -1,18 +1,17 @@
 """What a comparison can read without running anything: a study's folder, recordings, and `lerobot-eval`'s results."""
 
-import json
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
 import pandas as pd
-import yaml
 
 from lerobot_constructskill.comparison.sides import MAKER, Conditions, Outcomes, Side, merge_versions, read_versions
 from lerobot_constructskill.contract import LOOSE, SUITES
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, read_recordings
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_rows
+from lerobot_constructskill.lerobot_internals import EVALUATED
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_environments, read_rows
 
 EVAL_INFO = "eval_info.json"
 """What `lerobot-eval` writes into its output folder."""
@@ -47,11 +46,10 @@ def read_study(root: Path, arm: str) -> Side:
 
 
 def _env(root: Path, setting: str) -> dict:
-    try:
-        env = yaml.safe_load((root / STUDY).read_text())["settings"][setting]["env"]
-        return {**env, "task": env["task"]}
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise InputError(f"{root / STUDY} does not say how '{setting}' is evaluated ({error!r}).") from None
+    envs = read_environments(root)
+    if setting not in envs:
+        raise InputError(f"'{root / STUDY}' does not say how '{setting}' is evaluated.")
+    return envs[setting]
 
 
 def _outcomes(rows: pd.DataFrame) -> Outcomes | None:
@@ -63,7 +61,7 @@ def _outcomes(rows: pd.DataFrame) -> Outcomes | None:
 def recordings_in(folder: Path) -> list[Path]:
     """The files in a folder that recordings may be in: a study's run has one, $CONSTRUCTSKILL_RECORD many."""
     whole = folder / RECORDINGS
-    return [whole] if whole.is_file() else sorted(folder.glob("*.parquet"))
+    return [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
 
 
 def read_recorded(name: str, folders: Sequence[Path]) -> Side:
@@ -126,13 +124,9 @@ def read_evaluated(name: str, folders: Sequence[Path], first_start: int | None, 
 
 
 def _successes(file: Path, task: str | None, label: str) -> list[bool]:
-    try:
-        results = {
-            (str(one["task_group"]), int(one["task_id"])): [bool(success) for success in one["metrics"]["successes"]]
-            for one in json.loads(file.read_text())["per_task"]
-        }
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{file} is not what lerobot-eval writes ({error!r}).") from None
+    results = {
+        (one["task_group"], one["task_id"]): one["metrics"]["successes"] for one in EVALUATED.read(file)["per_task"]
+    }
     suites = {f"{suite}{label}": tasks for suite, tasks in SUITES.items()}
     ours = {key: own for key, own in results.items() if key[0] in suites or key[0] == f"{LOOSE}{label}"}
     if len(ours) == 1 and next(iter(ours))[0] == f"{LOOSE}{label}":

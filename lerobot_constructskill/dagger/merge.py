@@ -14,7 +14,7 @@ from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_round, totals
 from lerobot_constructskill.demos.advice import REVISION
-from lerobot_constructskill.demos.columns import EXPERT, SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
 from lerobot_constructskill.demos.modality import write_meanings
@@ -37,7 +37,7 @@ def obtain_data(plan: Plan, number: int, store: Store) -> LeRobotDataset:
     repo_id = f"local/{made.digest}"
     with store.claim([made]) as missing:
         if missing:
-            with store.writing(made) as folder, room_for(folder), quiet():
+            with store.writing(made) as folder, quiet():
                 _merge(plan, parts, repo_id, folder, store)
     return LeRobotDataset(repo_id, root=store.folder(made))
 
@@ -51,7 +51,7 @@ def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, 
         aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))
     write_statistics(folder)
     write_meanings(folder, plan.task, plan.base.obs_type)
-    facts = json.loads((base.root / SIDECAR).read_text())
+    facts = MADE.read(base.root / SIDECAR)
     facts["dagger"] = {
         "policy": plan.checkpoint(0).spec["policy"],
         "training_seed": plan.config.seed,
@@ -63,7 +63,9 @@ def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, 
 
 def write_sidecar(folder: Path, facts: dict[str, Any]) -> None:
     """Write how a data set was made, with the hashes of its files as they are."""
-    (folder / SIDECAR).write_text(json.dumps(facts | {"sha256": file_hashes(folder)}, indent=2) + "\n")
+    (folder / SIDECAR).write_text(
+        json.dumps(facts | {"sha256": file_hashes(folder)}, indent=2) + "\n", encoding="utf-8"
+    )
 
 
 def _add_columns(plan: Plan, base: LeRobotDataset, folder: Path) -> None:

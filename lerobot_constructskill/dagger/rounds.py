@@ -19,6 +19,7 @@ from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.merge import aggregate
 from lerobot_constructskill.demos.shards import EPISODE, whole, write_episode
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.training.trainers import trainer_of
@@ -49,6 +50,9 @@ class DrivenEpisode:
         return cls(episode.seed, episode.placed, len(episode.frames), by_expert)
 
 
+DRIVEN = Json("a round's episodes", list[DrivenEpisode])
+
+
 def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset, list[DrivenEpisode]]:
     """A round's frames and outcomes, in the order of its seeds; driven if they are not there.
 
@@ -63,7 +67,7 @@ def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset,
             with store.writing(made, keep=SHARDS) as folder:
                 _write_round(plan, number, repo_id, folder, store)
     folder = store.folder(made)
-    return LeRobotDataset(repo_id, root=folder), _read(folder / OUTCOMES)
+    return LeRobotDataset(repo_id, root=folder), DRIVEN.read(folder / OUTCOMES)
 
 
 def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpisode]:
@@ -77,7 +81,7 @@ def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpiso
             with store.writing(made) as folder:
                 folder.mkdir()
                 _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
-    return _read(store.folder(made) / OUTCOMES)
+    return DRIVEN.read(store.folder(made) / OUTCOMES)
 
 
 def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Store) -> None:
@@ -87,12 +91,12 @@ def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Sto
     features = dagger_features(plan.task, plan.base.obs_type)
     drive = Drive(number, plan.config.beta(number), plan.config.patience)
     for episode in _drive(plan, number - 1, seeds, drive, store):
-        with staged(shards / str(episode.seed)) as shard, room_for(folder):
+        with staged(shards / str(episode.seed)) as shard:
             shard.mkdir()
             if episode.frames:
                 write_episode(repo_id, plan.task, features, episode.frames, shard / EPISODE, plan.base.video)
             _save([DrivenEpisode.of(episode)], shard / OUTCOME)
-    outcomes = [outcome for seed in plan.seeds(number) for outcome in _read(shards / str(seed) / OUTCOME)]
+    outcomes = [outcome for seed in plan.seeds(number) for outcome in DRIVEN.read(shards / str(seed) / OUTCOME)]
     roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
     if not roots:
         raise InputError(f"Round {number} has no frame in which the expert knew a way to success.")
@@ -110,15 +114,11 @@ def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: S
 
 
 def _save(outcomes: Iterable[DrivenEpisode], path: Path) -> None:
-    path.write_text(json.dumps([asdict(outcome) for outcome in outcomes]) + "\n")
-
-
-def _read(path: Path) -> list[DrivenEpisode]:
-    return [DrivenEpisode(**fields) for fields in json.loads(path.read_text())]
+    path.write_text(json.dumps([asdict(outcome) for outcome in outcomes]) + "\n", encoding="utf-8")
 
 
 def _read_one(path: Path) -> DrivenEpisode:
-    (outcome,) = _read(path)
+    (outcome,) = DRIVEN.read(path)
     return outcome
 
 

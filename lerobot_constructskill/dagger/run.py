@@ -15,7 +15,7 @@ from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dagger.merge import obtain_data, parts_of, write_sidecar
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_evaluation, obtain_round, totals
-from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.columns import MADE, SIDECAR
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.training.checkpoints import read_facts, writing_checkpoint
 from lerobot_constructskill.training.trainers import flush_denormals, trainer_of
@@ -71,7 +71,7 @@ def run_dagger(plan: Plan, store: Store, root: Path, tell: Callable[[Line], None
             lines.append(line)
             tell(line)
         folder.mkdir()
-        (folder / ROUNDS).write_text(json.dumps([vars(line) for line in lines], indent=2) + "\n")
+        (folder / ROUNDS).write_text(json.dumps([vars(line) for line in lines], indent=2) + "\n", encoding="utf-8")
         shutil.copytree(store.folder(plan.checkpoint(plan.config.rounds)), folder / "checkpoint")
         _copy_data(plan, store, folder / "dataset")
     return lines
@@ -112,6 +112,6 @@ def make_checkpoint(plan: Plan, number: int, store: Store) -> None:
 def _copy_data(plan: Plan, store: Store, folder: Path) -> None:
     """The data set under its own name."""
     shutil.copytree(store.folder(plan.data(plan.config.rounds)), folder, ignore=shutil.ignore_patterns("spec.json"))
-    facts = json.loads((folder / SIDECAR).read_text())
+    facts = MADE.read(folder / SIDECAR)
     facts["generator"]["repo_id"] = plan.config.repo_id
     write_sidecar(folder, facts)

@@ -1,8 +1,7 @@
 """A finished data set as plain tables, read from its files alone: whoever checks LeRobot's work cannot ask LeRobot."""
 
-import json
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pandas as pd
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
+    MADE,
     SIDECAR,
     as_before_joints,
     dagger_features,
@@ -19,7 +19,12 @@ from lerobot_constructskill.demos.columns import (
 )
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.files import Json, read_parquet
+from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 from lerobot_constructskill.parsing import decode
+
+OBJECT = Json("a JSON object")
+STATISTICS = Json("statistics of columns", dict[str, dict[str, Any]])
 
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
 VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
@@ -37,6 +42,9 @@ class Facts(dict):
     def __init__(self, file: str, fields: dict[str, Any]):
         super().__init__(fields)
         self.file = file
+        for name, value in fields.items():
+            if isinstance(value, dict):
+                self[name] = Facts(file, value)
 
     def __missing__(self, name: str):
         raise InputError(f"{self.file} has no '{name}'.")
@@ -130,8 +138,8 @@ def open_dataset(root: Path) -> DataSet:
         raise InputError("meta/tasks.parquet has no column task_index.")
     data = DataSet(
         root=root,
-        info=read_facts(root, "meta/info.json"),
-        stats=read_facts(root, "meta/stats.json"),
+        info=read_facts(root, INFO, DATA_SET),
+        stats=read_facts(root, "meta/stats.json", STATISTICS),
         facts=read_provenance(root),
         rows=_tables(root, "data/*/*.parquet"),
         episodes=_tables(root, "meta/episodes/*/*.parquet"),
@@ -139,21 +147,11 @@ def open_dataset(root: Path) -> DataSet:
     )
     if data.rows.empty:
         raise InputError("data/ holds no frames.")
-    _check_features(data.info["features"])
     of_videos = [f"videos/{camera}/{name}" for camera in data.cameras for name in VIDEO_COLUMNS]
     missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
     if missing:
         raise InputError(f"meta/episodes/ has no column {missing[0]}.")
     return data
-
-
-def _check_features(features: Any) -> None:
-    described = isinstance(features, Facts) and all(isinstance(feature, Facts) for feature in features.values())
-    if not described:
-        raise InputError("features in meta/info.json must hold an object for every column.")
-    for feature in features.values():
-        if not isinstance(feature["dtype"], str) or not isinstance(feature["shape"], list):
-            raise InputError("features in meta/info.json must give every column a dtype and a shape.")
 
 
 def check_is_there(root: Path) -> None:
@@ -162,8 +160,8 @@ def check_is_there(root: Path) -> None:
     Raises:
         FileNotFoundError: meta/info.json, which every data set has, is missing.
     """
-    if not (root / "meta" / "info.json").is_file():
-        raise MissingError(f"There is no data set in {root}: meta/info.json is missing.")
+    if not (root / INFO).is_file():
+        raise MissingError(f"There is no data set in {root}: {INFO} is missing.")
 
 
 def read_provenance(root: Path) -> Facts:
@@ -178,32 +176,21 @@ def read_provenance(root: Path) -> Facts:
             f"{root} has no {SIDECAR}, which says how it was made: only constructskill-generate writes it, and "
             "lerobot-edit-dataset removes it when it deletes, splits or merges."
         )
-    return read_facts(root, SIDECAR)
+    return read_facts(root, SIDECAR, MADE)
 
 
-def read_facts(root: Path, name: str) -> Facts:
+def read_facts(root: Path, name: str, kind: Json = OBJECT) -> Facts:
     """The JSON object in a file of a folder.
 
     Raises:
-        InputError: the file cannot be read, or holds something else.
+        MissingError: there is no such file.
+        InputError: it holds something else.
     """
-    try:
-        facts = json.loads((root / name).read_text(), object_hook=partial(Facts, name))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{name} cannot be read ({error}).") from None
-    if not isinstance(facts, Facts):
-        raise InputError(f"{name} must hold a JSON object, not {type(facts).__name__}.")
-    return facts
+    return Facts(name, kind.read(root / name))
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:
     paths = sorted(root.glob(pattern))
     if not paths:
         raise InputError(f"{pattern} cannot be read (there is no such file).")
-    tables = []
-    for path in paths:
-        try:
-            tables.append(pd.read_parquet(path))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path.relative_to(root)} cannot be read ({error}).") from None
-    return pd.concat(tables, ignore_index=len(paths) > 1)
+    return pd.concat([read_parquet(path).to_pandas() for path in paths], ignore_index=len(paths) > 1)

@@ -1,6 +1,5 @@
 """Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
 
-import json
 import logging
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -10,11 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_constructskill.artifacts.digests import data_sha256, files_below
-from lerobot_constructskill.artifacts.store import SPEC
+from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
 from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
 from lerobot_constructskill.dataset.frames import packet_times
-from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError, UserError, plural
-from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
+from lerobot_constructskill.errors import (
+    InputError,
+    MachineError,
+    MissingError,
+    TakenError,
+    UserError,
+    first_line,
+    plural,
+)
+from lerobot_constructskill.lerobot_internals import DATA_SET, INFO, TRAIN_CONFIG, TRAINED
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -31,9 +38,6 @@ PUSHED = [
     "videos/*.mp4",
 ]
 """What leaves the machine; `*` stands for folders as well."""
-
-INFO = "meta/info.json"
-"""What makes a folder a data set of LeRobot's."""
 
 SAME_RATE = 0.01
 """Share by which a video's rate may differ from the data set's."""
@@ -105,13 +109,21 @@ def open_lerobot(
     try:
         with one_sentence(repo_id, revision):
             dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
-    except (UserError, OSError):
-        raise
+    except (UserError, OSError) as error:
+        if root is None:
+            raise
+        # It looks on the Hub for what it cannot read, and its last word is about that.
+        raise MachineError(f"LeRobot cannot open the data set in {root} ({first_line(_first(error))}).") from error
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
         said = f"{type(error).__name__}: {error}"
         raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({said}).") from error
     _check_videos(dataset)
     return dataset
+
+
+def _first(error: BaseException) -> BaseException:
+    """The first of the exceptions that led to one."""
+    return _first(error.__context__) if error.__context__ else error
 
 
 def _check_videos(dataset: "LeRobotDataset") -> None:
@@ -171,7 +183,7 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     path = checkpoint / TRAIN_CONFIG
     if not path.is_file():
         return set() if _holds_out_as_the_contract(checkpoint) else None
-    told = json.loads(path.read_text()).get("dataset", {})
+    told = TRAINED.read(path).get("dataset", {})
     folder = Path(told["root"]) if told.get("root") else HF_LEROBOT_HOME / told.get("repo_id", "")
     sources = _sources(folder)
     is_it = (
@@ -188,14 +200,14 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
 
 def _holds_out_as_the_contract(checkpoint: Path) -> bool:
     path = checkpoint / SPEC
-    told = json.loads(path.read_text()) if path.is_file() else {}
+    told = SPECIFICATION.read(path) if path.is_file() else {}
     return told.get("training", {}).get("holdout") == HELD_OUT_EVERY
 
 
 def _sources(root: Path) -> list[dict[str, str]]:
     """What a feature set that lies in a folder says of the data set whose features it holds."""
     path = root / INFO
-    features = json.loads(path.read_text())["features"] if path.is_file() else {}
+    features = DATA_SET.read(path)["features"] if path.is_file() else {}
     infos = [feature.get("info") or {} for feature in features.values()]
     return [info for info in infos if "source_repo_id" in info]
 

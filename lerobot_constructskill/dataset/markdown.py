@@ -14,7 +14,7 @@ def render(template: str, **facts: Any) -> str:
 
     layout = {"trim_blocks": True, "lstrip_blocks": True}
     environment = Environment(undefined=StrictUndefined, autoescape=True, finalize=_plain, **layout)
-    return environment.from_string(files(__package__).joinpath(template).read_text()).render(**facts)
+    return environment.from_string(files(__package__).joinpath(template).read_text(encoding="utf-8")).render(**facts)
 
 
 def _plain(value: Any) -> Any:

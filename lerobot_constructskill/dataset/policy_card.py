@@ -5,9 +5,8 @@ from typing import Any
 
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 from lerobot_constructskill.dataset import markdown
-from lerobot_constructskill.dataset.dataset import read_facts
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.lerobot_internals import largest_rewards
+from lerobot_constructskill.lerobot_internals import EVALUATED
 
 
 def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
@@ -18,14 +17,12 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     """
     outcomes = []
     for path in folder.glob("seed_*/eval_info.json"):
-        info = read_facts(folder, str(path.relative_to(folder)))
-        try:
-            stages = largest_rewards(info)
-            seed = int(path.parent.name.removeprefix("seed_"))
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path} is not what lerobot-eval writes ({error}).") from None
+        name = path.parent.name.removeprefix("seed_")
+        if not name.isdecimal():
+            raise InputError(f"'{path.parent}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
-        outcomes.append((seed, lifted, placed, len(stages)))
+        outcomes.append((int(name), lifted, placed, len(stages)))
     if not outcomes:
         raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
     return sorted(outcomes)
@@ -34,14 +31,14 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
 def render_outcomes(
     outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
 ) -> str:
-    """The section, in Markdown, from `train_config.json` and the policy's `config.json`."""
+    """The section, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
     backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256", "precision")}
     return markdown.render(
         "policy_card.md.j2",
         outcomes=outcomes,
         task=task,
-        this_seed=train["seed"],
-        dataset=train["dataset"]["repo_id"],
-        revision=train["dataset"]["revision"],
+        this_seed=train.get("seed"),
+        dataset=train.get("dataset", {}).get("repo_id"),
+        revision=train.get("dataset", {}).get("revision"),
         backbone=backbone | {"name": policy["backbone"]} if "backbone" in policy else None,
     )

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.dataset.dataset import check_is_there
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import read_parquet
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,8 @@ def split_of(root: Path) -> Split:
     """
     check_is_there(root)
     files = sorted(root.glob("meta/episodes/*/*.parquet"))
-    try:
-        tables = [pq.read_table(file, columns=["episode_index", "length", "tasks"]) for file in files]
-        rows = pa.concat_tables(tables).sort_by("episode_index").to_pylist()
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"The episodes of {root}, meta/episodes/, cannot be read ({error}).") from None
+    tables = [read_parquet(file, ["episode_index", "length", "tasks"]) for file in files]
+    rows = pa.concat_tables(tables).sort_by("episode_index").to_pylist() if tables else []
     if not rows:
         raise InputError(f"The data set in {root} has no episodes.")
     return split([row["length"] for row in rows], [next(iter(row["tasks"]), "") for row in rows])

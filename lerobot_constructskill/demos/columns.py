@@ -4,15 +4,24 @@ Every LeRobot policy consumes each `observation.*` column and predicts each `act
 bear those names.
 """
 
-from typing import Any
+from typing import Any, TypedDict
 
 from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, OBS_TYPES, SIM_STATE, STATE_NAMES, Task
+from lerobot_constructskill.files import Json
 
 ACTORS = EXPERT, LEARNER = "expert", "learner"
 """Whose action was executed in a frame; the demonstrations' noise is the expert's."""
 
 SIDECAR = "meta/constructskill.json"
 """Where a data set keeps how it was made, relative to its root."""
+
+
+class _Made(TypedDict):
+    generator: dict[str, Any]
+
+
+MADE = Json("the record of how a data set was made", _Made)
+"""Of the file `SIDECAR`."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
 """Columns that data sets of earlier versions lack; such sets also have no channel names in `sim.*` and `next.*`."""

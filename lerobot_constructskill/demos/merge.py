@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.artifacts.disk import room_for
@@ -18,6 +17,7 @@ from lerobot_constructskill.demos.modality import write_meanings
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import read_parquet
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -56,7 +56,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         "versions": frame_versions(config.task),
         "sha256": file_hashes(folder),
     }
-    (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n")
+    (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
 
 
 def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
@@ -114,6 +114,6 @@ def frame_statistics(folder: Path) -> dict[str, dict[str, np.ndarray]]:
         if feature["dtype"] in ("string", "image", "video"):
             continue
         paths = (path for path in files_below(folder, "data") if path.suffix == ".parquet")
-        column = np.concatenate([np.stack(pd.read_parquet(path, columns=[name])[name]) for path in paths])
+        column = np.concatenate([np.stack(read_parquet(path, [name]).to_pandas()[name]) for path in paths])
         statistics |= compute_episode_stats({name: column.astype(np.float64)}, features)
     return statistics

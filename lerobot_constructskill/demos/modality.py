@@ -20,7 +20,7 @@ ACTION_PARTS = {"end_effector_position": TRANSLATION, "end_effector_rotation": R
 def write_meanings(root: Path, task: Task, obs_type: str) -> None:
     """Write both files of a data set of `task` seen as `obs_type`."""
     for name, content in ((MODALITY, modality(task, obs_type)), (CONTRACT, describe_task(task, OBS_TYPES[obs_type]))):
-        (root / name).write_text(json.dumps(content, indent=2) + "\n")
+        (root / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def modality(task: Task, obs_type: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ Every attempt becomes a shard, as many at a time as there are workers; a run tha
 shards that it finished.
 """
 
+import logging
 import shutil
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
@@ -11,16 +12,18 @@ from itertools import count
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.code import check_unedited
-from lerobot_constructskill.artifacts.disk import disk_of, room_for
+from lerobot_constructskill.artifacts.disk import disk_of
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.pools import open_pool
-from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP, OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
 from lerobot_constructskill.demos.shards import Attempt, attempt, finished
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
 from lerobot_constructskill.progress import Progress, quiet
+
+logger = logging.getLogger(__name__)
 
 SHARDS = "shards"
 
@@ -58,11 +61,18 @@ def record(config: GenerateConfig) -> Summary:
 
 def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
     """Write the data set to a path that `staged` gave, by way of shards beside it. Raises as `record` does."""
+    starts = config.starts
+    if starts.start < DEMO_SEED_START or starts.stop > DEMO_SEED_STOP:
+        logger.warning(
+            "Seeds %d to %d are not among those of demonstrations, %d to %d: a policy that is evaluated from one of "
+            "them has seen its start.",
+            *(starts.start, starts.stop - 1, DEMO_SEED_START, DEMO_SEED_STOP - 1),
+        )
     shards = folder.with_name(SHARDS) / frames_digest(config)
     before = frame_versions(config.task)
     attempts = _run_attempts(config, shards)
     check_unedited(before, frame_versions(config.task))
-    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet(), room_for(folder):
+    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
         merge(config, attempts, shards, folder)
     return attempts
 

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 
-from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.contract import FPS, Task, get_task
 from lerobot_constructskill.demos.columns import demonstration_features
@@ -18,6 +17,7 @@ from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.progress import quiet
 
 OUTCOME = "attempt.json"
@@ -48,6 +48,9 @@ class Attempt:
     backend: str
 
 
+ATTEMPT = Json("an attempt's outcome", Attempt)
+
+
 def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     """Run the attempt of `seed` and write its shard `folder/<seed>`, whole or not at all.
 
@@ -62,11 +65,10 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     outcome = Attempt(seed, success, len(frames), env.light_robot, env.backend)
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
-        with room_for(shard):
-            if success:
-                features = demonstration_features(task, config.obs_type)
-                write_episode(config.repo_id, task, features, frames, shard / EPISODE, config.video)
-            (shard / OUTCOME).write_text(json.dumps(asdict(outcome)))
+        if success:
+            features = demonstration_features(task, config.obs_type)
+            write_episode(config.repo_id, task, features, frames, shard / EPISODE, config.video)
+        (shard / OUTCOME).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
     return outcome
 
 
@@ -78,8 +80,7 @@ def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | N
 
 def finished(folder: Path) -> dict[int, Attempt]:
     """The attempts whose shards lie in `folder`, by seed."""
-    outcomes = whole(folder, OUTCOME, lambda path: Attempt(**json.loads(path.read_text())))
-    return {outcome.seed: outcome for outcome in outcomes}
+    return {outcome.seed: outcome for outcome in whole(folder, OUTCOME, ATTEMPT.read)}
 
 
 def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> list[Kind]:
@@ -91,7 +92,7 @@ def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> lis
     for path in sorted(folder.glob(f"*/{outcome}")):
         try:
             found.append(read(path))
-        except (ValueError, TypeError):
+        except ValueError:
             shutil.rmtree(path.parent)
     return found
 

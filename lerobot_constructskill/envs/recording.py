@@ -19,9 +19,8 @@ import pyarrow.parquet as pq
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
-from lerobot_constructskill.artifacts.tables import with_later_columns
+from lerobot_constructskill.artifacts.tables import VERSIONS, Table
 from lerobot_constructskill.contract import STAGES
-from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import Perturbation
 
 FOLDER = "CONSTRUCTSKILL_RECORD"
@@ -117,9 +116,9 @@ class Recording(Outcome):
 
 ACTIONS = pa.list_(pa.field("element", pa.float32(), nullable=False))
 
-_ARROW = {str: pa.string(), int: pa.int64(), bool: pa.bool_(), int | None: pa.int64(), list[np.ndarray]: ACTIONS}
-
-SCHEMA = pa.schema([(one.name, _ARROW[one.type]) for one in fields(Recording)])
+TABLE = Table(
+    "a recording", Recording, {list[np.ndarray]: ACTIONS}, later=("clipped_steps",), json={"versions": VERSIONS}
+)
 
 
 def compressed(actions: str) -> dict[str, Any]:
@@ -155,7 +154,7 @@ def write_recordings(recordings: Iterable[Recording], path: Path) -> None:
     """Write a parquet file, which appears whole or not at all."""
     rows = [vars(each) | {"actions": each.flat} for each in recordings]
     with replaced(path) as partial:
-        pq.write_table(pa.Table.from_pylist(rows, schema=SCHEMA), partial, **compressed("actions"))
+        pq.write_table(pa.Table.from_pylist(rows, schema=TABLE.schema), partial, **compressed("actions"))
 
 
 def read_recordings(path: Path) -> list[Recording]:
@@ -164,13 +163,7 @@ def read_recordings(path: Path) -> list[Recording]:
     Raises:
         InputError: it holds something else.
     """
-    try:
-        table = pq.read_table(path)
-    except pa.ArrowInvalid as error:
-        raise InputError(f"'{path}' cannot be read: {error}") from None
-    table = with_later_columns(table, SCHEMA, ("clipped_steps",))
-    if not table.schema.equals(SCHEMA):
-        raise InputError(f"'{path}' is not a recording of this version.")
+    table = TABLE.read(path)
     flat = [np.asarray(actions.values) for actions in table["actions"]]
     rows = table.drop_columns("actions").to_pylist()
     return [Recording(**row, actions=[actions]) for row, actions in zip(rows, flat, strict=True)]

@@ -5,17 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from lerobot.datasets import LeRobotDataset, modify_features, write_stats
 from lerobot.utils import DEFAULT_FEATURES
 from torch import Tensor
 
 from lerobot_constructskill.artifacts.digests import data_sha256, digest
-from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features.points import POSES, find_points
+from lerobot_constructskill.files import read_parquet
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
@@ -105,13 +104,12 @@ def write_feature_set(
     made_of = {**info, "camera": camera, "patches": patches}
     parts = _parts_folder(folder, made_of)
     found = _find_points(dataset, camera, encoder.crop) if points else {}
-    with room_for(folder):
-        features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
-        _write_copy(dataset, camera, features, info, repo_id, folder, found)
-        if patches:
-            of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
-            _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
-            bind_patches(folder)
+    features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
+    _write_copy(dataset, camera, features, info, repo_id, folder, found)
+    if patches:
+        of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
+        _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
+        bind_patches(folder)
 
 
 def join_feature_sets(
@@ -135,11 +133,10 @@ def join_feature_sets(
     found = {name: np.concatenate([_column(part, name) for part in parts])} if points else {}
     if sum(map(len, pooled)) != dataset.num_frames:
         raise InputError(f"The parts of '{dataset.repo_id}' do not add up to its {dataset.num_frames} frames.")
-    with room_for(folder):
-        _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder, found)
-        if patches:
-            _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
-            bind_patches(folder)
+    _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder, found)
+    if patches:
+        _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
+        bind_patches(folder)
 
 
 def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
@@ -260,6 +257,6 @@ def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) 
 def _forget_videos(root: Path) -> None:
     """Drop what the copied episode tables still say about videos that the copy does not have."""
     for path in (root / "meta" / "episodes").rglob("*.parquet"):
-        table = pd.read_parquet(path)
+        table = read_parquet(path).to_pandas()
         gone = [name for name in table if name.startswith(("videos/", "stats/observation.images."))]
         table.drop(columns=gone).to_parquet(path, index=False)

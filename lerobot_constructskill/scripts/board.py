@@ -26,7 +26,7 @@ def board(config: BoardConfig) -> str:
 
     Raises:
         MissingError: there is no board.
-        InputError: an entry is no submission.
+        InputError: entries cannot be read; the board is there without them.
         OSError: there is nothing to render films with.
     """
     from lerobot_constructskill.board.site import write_board

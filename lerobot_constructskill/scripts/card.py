@@ -28,7 +28,7 @@ def write_card(config: CardConfig) -> str:
         FileNotFoundError: there is no data set in `root`.
         ValueError: a file that cannot be read.
     """
-    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.artifacts.folders import write_text
     from lerobot_constructskill.dataset.card import card_facts, render
     from lerobot_constructskill.dataset.dataset import open_dataset
     from lerobot_constructskill.dataset.plots import contact_sheet, trajectories
@@ -37,11 +37,9 @@ def write_card(config: CardConfig) -> str:
     facts = card_facts(data) | ({"repo_id": config.repo_id} if config.repo_id else {})
     contact_sheet(data, out / "pictures" / "contact_sheet.jpg")
     trajectories(data, out / "pictures" / "trajectories.png")
-    with replaced(out / "README.md") as partial:
-        partial.write_text(render(facts))
+    write_text(out / "README.md", render(facts))
     if config.facts:
-        with replaced(config.facts) as partial:
-            partial.write_text(json.dumps(facts, indent=2) + "\n")
+        write_text(config.facts, json.dumps(facts, indent=2) + "\n")
     return f"Card and pictures written to {out}"
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.bounds import RepoId, Text, check
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import run, say
 
 
 @dataclass
@@ -38,7 +38,7 @@ def check_dataset(config: CheckConfig) -> str:
         found = complaints(data, one)
         wrong += bool(found)
         with Progress.external_write_mode():
-            print(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip(), flush=True)
+            say(f"{'FAIL' if found else 'OK':<4}  {name:<12}  {' '.join(found)}".rstrip())
     if wrong:
         raise InputError(f"{wrong} of {len(CHECKS)} checks found something wrong with {data.root}.")
     size = f"{plural(len(data.episodes), 'demonstration')}, {plural(len(data.rows), 'frame')}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from lerobot_constructskill.analysis.section import Level
 from lerobot_constructskill.bounds import Among, Count, Device, Seed, Steps, Text, check
 from lerobot_constructskill.contract import OBS_TYPES
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import run, say
 
 if TYPE_CHECKING:
     from lerobot_constructskill.comparison.find import Found
@@ -98,10 +98,10 @@ def compare(config: CompareConfig) -> str:
         comparison = match.compare(a, b, asked, evaluated, config.alpha)
         if folder:
             folder.mkdir(exist_ok=True)
-            (folder / "comparison.json").write_text(as_json(comparison))
+            (folder / "comparison.json").write_text(as_json(comparison), encoding="utf-8")
     told = tell(comparison, config.alpha)
     if config.fail_if == comparison.judgement.verdict:
-        print(told)
+        say(told)
         raise SystemExit(FAILED)
     return told
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_constructskill.bounds import Count, RepoId, check
 from lerobot_constructskill.errors import InputError, MissingError, TakenError, plural
+from lerobot_constructskill.files import read_bytes
 from lerobot_constructskill.presets import KINDS, description, find, named, names
-from lerobot_constructskill.scripts.console import EPILOG, Parser, edge
+from lerobot_constructskill.scripts.console import EPILOG, Parser, edge, say
 
 if TYPE_CHECKING:
     from lerobot_constructskill.dataset.split import Split
@@ -81,7 +82,7 @@ def write(training: TrainingFile) -> Path:
         OSError: the Hub does not have the data set, or the file cannot be written.
     """
     from lerobot_constructskill import tags
-    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.artifacts.folders import write_text
     from lerobot_constructskill.dataset.split import split_of
 
     template = tags.read(named("train", training.name))
@@ -91,12 +92,11 @@ def write(training: TrainingFile) -> Path:
     split = split_of(training.root or _find_set(training.repo_id))
     passes = training.passes or template["passes"]
     text = f"{_comment(training, split, passes)}\n{_dump(fill(template, source, split, passes))}"
-    if training.file.exists() and not training.file.read_text(errors="replace").startswith(f"# {TRAIN}"):
+    if training.file.exists() and not read_bytes(training.file).startswith(f"# {TRAIN}".encode()):
         raise TakenError(
             f"{training.file} exists and was not written by constructskill-config: name another with --out."
         )
-    with replaced(training.file) as partial:
-        partial.write_text(text)
+    write_text(training.file, text)
     return training.file
 
 
@@ -172,11 +172,11 @@ def main() -> None:
         arguments = vars(parser.parse_args())
         name = arguments.pop("name")
         if name is not None and name.startswith(TRAIN):
-            print(write(TrainingFile(name.removeprefix(TRAIN), **arguments)))
+            say(write(TrainingFile(name.removeprefix(TRAIN), **arguments)))
         elif given := [flag for flag, value in arguments.items() if value is not None]:
             raise InputError(f"--{given[0]} is for configurations of {TRAIN}, which are written for a data set.")
         else:
-            print(show(name))
+            say(show(name))
 
 
 if __name__ == "__main__":

@@ -3,17 +3,22 @@
 import argparse
 import logging
 import os
-import shlex
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from datetime import datetime
+from contextlib import contextmanager, suppress
+from functools import cache
 from itertools import takewhile
 from pathlib import Path
 from typing import NoReturn
 
-from lerobot_constructskill.errors import InputError, UserError, full_traceback, remedy_of
+from lerobot_constructskill.errors import (
+    InputError,
+    MachineError,
+    UserError,
+    full_traceback,
+    keep_traceback,
+    remedy_of,
+)
 from lerobot_constructskill.presets import find, names
 
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
@@ -47,7 +52,7 @@ def run[Config](
         flags, epilog = _put_names(sys.argv[1:], first), EPILOG
         if presets:
             flags, epilog = _put_file(flags, presets), f"{_tell_names(presets)} {EPILOG}"
-        print(action(parse(config_class, flags, epilog=epilog)))
+        say(action(parse(config_class, flags, epilog=epilog)))
 
 
 def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
@@ -83,13 +88,53 @@ def edge() -> Iterator[None]:
     command, debug = list(sys.argv), DEBUG in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != DEBUG]
     logging.getLogger().addFilter(_is_news)
+    _open_streams()
+    _hear_no_destructors()
     try:
         yield
-        sys.stdout.flush()
-    except BrokenPipeError:  # of `| head`, which has read enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if _unread:
+            said = f"standard output cannot be written to ({_unread.pop().strerror}); what was asked for is done"
+            raise MachineError(said)
     except (Exception, KeyboardInterrupt) as error:
         sys.exit(_report(error, command, debug))
+
+
+def _open_streams() -> None:
+    """Have somewhere to write to, whatever the shell closed and whatever letters its locale has."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            with suppress(OSError):  # the next file would have its number, and be written into
+                os.dup2(os.open(os.devnull, os.O_RDWR), number)
+            setattr(sys, name, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  for good
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            with suppress(OSError):  # of a stream that another program has put in its place
+                stream.reconfigure(errors="backslashreplace")
+
+
+@cache
+def _hear_no_destructors() -> None:
+    """A full disk is told in one sentence: the destructors of PyAV would tell it once more, in tracebacks."""
+    of_errors, of_destructors = sys.excepthook, sys.unraisablehook
+    sys.excepthook = lambda kind, error, trace: isinstance(error, OSError) or of_errors(kind, error, trace)
+    sys.unraisablehook = lambda said: isinstance(said.exc_value, OSError) or of_destructors(said)
+
+
+def say(text: str) -> None:
+    """Print what a command has to say. That nobody can read it stops no work, and is said when that is done.
+
+    A reader who has read enough, such as `head`, is no fault.
+    """
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            _unread.append(error)
+
+
+_unread: list[OSError] = []
+"""Why standard output cannot be written to."""
 
 
 def _is_news(record: logging.LogRecord) -> bool:
@@ -100,7 +145,7 @@ def _is_news(record: logging.LogRecord) -> bool:
 def _report(error: BaseException, command: list[str], debug: bool) -> int:
     """Tell the user, keep the traceback, and return the exit status."""
     name, told = Path(command[0]).stem, full_traceback(error)
-    log = _keep(name, f"{datetime.now():%Y-%m-%d %H:%M:%S}  {shlex.join(command)}\n{told}\n")
+    log = keep_traceback(command, told)
     if debug or log is None:
         print(told, file=sys.stderr)
     status, sentence = _judge(error)
@@ -119,22 +164,3 @@ def _judge(error: BaseException) -> tuple[int, str]:
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("lerobot_constructskill"):
         return REFUSED, remedy_of(error) or f"{said}; constructskill-doctor says what is not installed"
     return FAULT, f"this is a fault of constructskill, not of your input: {type(error).__name__}: {said}"
-
-
-def _keep(name: str, entry: str) -> Path | None:
-    """Add to a command's log, or where the home folder cannot be written to a new one; None if that fails as well."""
-    try:
-        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "constructskill"
-        folder.mkdir(parents=True, exist_ok=True)
-        log = folder / f"{name}.log"
-        with log.open("a") as file:
-            file.write(entry)
-        return log
-    except (OSError, RuntimeError):  # Path.home raises the latter for a user who has none
-        pass
-    try:
-        with tempfile.NamedTemporaryFile("w", prefix=f"{name}-", suffix=".log", delete=False) as file:
-            file.write(entry)
-        return Path(file.name)
-    except OSError:
-        return None

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.errors import plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import run, say
 
 
 def dagger(config: DaggerConfig) -> str:
@@ -20,9 +20,7 @@ def dagger(config: DaggerConfig) -> str:
     from lerobot_constructskill.dagger.run import run_dagger
 
     root = Path(config.root) if config.root else Path("outputs/dagger") / config.repo_id.split("/")[1]
-    lines = run_dagger(
-        Plan(config), Store(config.store.absolute()), root.absolute(), lambda line: print(line, flush=True)
-    )
+    lines = run_dagger(Plan(config), Store(config.store.absolute()), root.absolute(), say)
     size = f"{plural(config.rounds, 'round')}, {plural(lines[-1].frames, 'frame')}"
     return f"{size}: {root}/dataset, {root}/checkpoint"
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.bounds import Device, Episodes, Range, RepoId, Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
@@ -75,8 +76,8 @@ def fit_noise(config: FitNoiseConfig) -> str:
     }
     del generator["repo_id"]
     generator["noise"] |= {"model": "dart", "covariance": covariance.tolist(), "fitted_on": fitted_on}
-    config.out.parent.mkdir(parents=True, exist_ok=True)
-    config.out.write_text(f"# DART iteration {fitted_on['iteration']}.\n{yaml.safe_dump(generator, sort_keys=False)}")
+    text = yaml.safe_dump(generator, sort_keys=False)
+    write_text(config.out, f"# DART iteration {fitted_on['iteration']}.\n{text}")
     deviations = ", ".join(f"{1000 * value:.2f}" for value in np.sqrt(np.diag(covariance)))
     return f"Noise of {deviations} mm (x, y, z) from {plural(int(fitted_on['frames']), 'frame')}: {config.out}"
 

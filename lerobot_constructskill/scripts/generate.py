@@ -2,7 +2,7 @@
 
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.errors import plural, remedy_of
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import run, say
 
 
 def generate(config: GenerateConfig) -> str:
@@ -10,9 +10,9 @@ def generate(config: GenerateConfig) -> str:
 
     summary = record(config)
     try:
-        print(write_card(CardConfig(summary.root)), flush=True)
+        say(write_card(CardConfig(summary.root)))
     except ModuleNotFoundError as error:  # the demonstrations are whole; constructskill-card writes it later
-        print(f"No card: {remedy_of(error) or error}", flush=True)
+        say(f"No card: {remedy_of(error) or error}")
     return (
         f"{plural(summary.episodes, 'demonstration')}, {plural(summary.frames, 'frame')}, "
         f"{plural(len(summary.discarded_seeds), 'attempt')} discarded: {summary.root}"

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
-from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.store import SPEC
+from lerobot_constructskill.artifacts.folders import replaced, write_text
+from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
 from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
 from lerobot_constructskill.errors import MissingError, plural
-from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
 
 Patterns = Annotated[list[Text], NotEmpty()]
@@ -111,9 +111,9 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 def _training_seed(checkpoint: Path) -> int | None:
     """As `lerobot-train` keeps it, or a study."""
-    for path in (checkpoint / TRAIN_CONFIG, checkpoint / SPEC):
-        if path.is_file():
-            return json.loads(path.read_text()).get("seed")
+    for name, kind in ((TRAIN_CONFIG, TRAINED), (SPEC, SPECIFICATION)):
+        if (checkpoint / name).is_file():
+            return kind.read(checkpoint / name).get("seed")
     return None
 
 
@@ -121,8 +121,7 @@ def _write(rows: list[dict], folder: Path) -> str:
     import pandas as pd
 
     table = pd.DataFrame(rows).astype(TYPES)
-    with replaced(folder / "offline.json") as partial:
-        partial.write_text(json.dumps(rows, indent=2) + "\n")
+    write_text(folder / "offline.json", json.dumps(rows, indent=2) + "\n")
     with replaced(folder / "offline.parquet") as partial:
         table.to_parquet(partial, index=False)
     shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")

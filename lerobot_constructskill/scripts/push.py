@@ -6,7 +6,8 @@ from pathlib import Path
 
 from lerobot_constructskill.bounds import RepoId, Word, check
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.files import read_text
+from lerobot_constructskill.scripts.console import run, say
 
 
 @dataclass
@@ -52,11 +53,11 @@ def push_dataset(config: PushConfig) -> str:
             f"{config.root} is not pushed, because the checks found {plural(len(wrong), 'fault')}; {wrong[0]}"
         )
     card = config.root / "README.md"
-    text = card.read_text() if card.is_file() else ""
+    text = read_text(card) if card.is_file() else ""
     named = re.search(r"^# (\S+/\S+)$", text, re.MULTILINE)
     is_anothers = named and named[1] != config.repo_id
     if not text or (is_anothers and text == render(card_facts(data) | {"repo_id": named[1]})):
-        print(write_card(CardConfig(config.root, config.repo_id)), flush=True)
+        say(write_card(CardConfig(config.root, config.repo_id)))
     return f"Pushed: {push(config.root, config.repo_id, config.private, config.tag, config.update)}"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from lerobot_constructskill.bounds import RepoId, check
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import MissingError
-from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
 
 
@@ -32,24 +32,20 @@ def push_policy(config: PushPolicyConfig) -> str:
         FileNotFoundError: there is no checkpoint, or no evaluation.
         OSError: the Hub refused, or the connection broke.
     """
+    from lerobot_constructskill.dataset.dataset import read_facts
     from lerobot_constructskill.dataset.hub import check_private, one_sentence
     from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 
-    train, policy = (_read(config.policy_path / name) for name in (TRAIN_CONFIG, "config.json"))
+    for name in (TRAIN_CONFIG, "config.json"):
+        if not (config.policy_path / name).is_file():
+            raise MissingError(f"{config.policy_path / name} is missing: name a checkpoint's pretrained_model folder.")
+    train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), read_facts(config.policy_path, "config.json")
     section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
     with one_sentence(config.repo_id):
         if config.private:
             check_private(config.repo_id)
         _push(config, section, policy["device"])
     return f"Pushed: {config.repo_id}"
-
-
-def _read(path: Path) -> dict:
-    from lerobot_constructskill.dataset.dataset import read_facts
-
-    if not path.is_file():
-        raise MissingError(f"{path} is missing: name a checkpoint's pretrained_model folder.")
-    return read_facts(path.parent, path.name)
 
 
 def _push(config: PushPolicyConfig, section: str, device: str | None) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.bounds import Episodes, RepoId, Text, check
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import run, say
 
 
 @dataclass
@@ -43,7 +43,7 @@ def replay_all(config: ReplayConfig) -> str:
     added, phases = 1000 * data.column("dart.noise"), data.column("phase")
     for phase in Phase:
         noise = added[phases == phase]
-        print(f"{phase:<9} {len(noise):6} frames, added mean {noise.mean(0).round(2)} std {noise.std(0).round(2)} mm")
+        say(f"{phase:<9} {len(noise):6} frames, added mean {noise.mean(0).round(2)} std {noise.std(0).round(2)} mm")
     replays = {episode: replay(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:

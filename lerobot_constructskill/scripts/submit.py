@@ -50,11 +50,10 @@ def submit(config: SubmitConfig) -> str:
         InputError: an episode is missing, or a file is not what it should be.
     """
     from lerobot_constructskill.board import collect
-    from lerobot_constructskill.board.strangers import make, read_yaml
-    from lerobot_constructskill.board.submission import EPISODES, About
+    from lerobot_constructskill.board.submission import ABOUT, EPISODES, SETTINGS
 
-    about = make(About, read_yaml(config.about.read_bytes(), str(config.about)), str(config.about))
-    settings = _settings(config)
+    about = ABOUT.read(config.about)
+    settings = SUITES[config.suite].settings if config.settings is None else SETTINGS.read(config.settings)
     failures = {int(seed): why for seed, why in config.failures.items()}
     if config.study is None:
         piles = collect.recorded_in(config.recorded)
@@ -68,18 +67,6 @@ def submit(config: SubmitConfig) -> str:
         f"{plural(len(made.declaration.training_seeds), 'training seed')}, "
         f"{size / 1e6:.2f} MB; now constructskill-verify."
     )
-
-
-def _settings(config: SubmitConfig) -> dict:
-    from lerobot_constructskill.board.protocol import Setting
-    from lerobot_constructskill.board.strangers import make, read_yaml
-
-    if config.settings is None:
-        return SUITES[config.suite].settings
-    said = read_yaml(config.settings.read_bytes(), str(config.settings))
-    if not isinstance(said, dict):
-        raise InputError(f"'{config.settings}' must be a mapping of names to settings.")
-    return {name: make(Setting, of, f"{config.settings}, {name}") for name, of in said.items()}
 
 
 def main() -> None:

@@ -82,7 +82,7 @@ def _record(path: Path, facts: dict) -> None:
 
 
 def _add(path: Path, facts: dict) -> None:
-    from lerobot_constructskill.artifacts.folders import replaced
+    from lerobot_constructskill.artifacts.folders import write_text
     from lerobot_constructskill.artifacts.processor import processor
     from lerobot_constructskill.board.entries import read_verdict
     from lerobot_constructskill.board.protocol import CLAIMED, LEVELS
@@ -90,11 +90,10 @@ def _add(path: Path, facts: dict) -> None:
     before = read_verdict(path, {"submission": facts["submission"]})
     facts = {"date": before.get("date", datetime.now(UTC).date().isoformat())} | facts
     if LEVELS.index(before.get("level", CLAIMED)) > LEVELS.index(facts["level"]):
-        facts = facts | {"level": before["level"], "rerun": before["rerun"]}
+        facts |= {name: before[name] for name in ("level", "rerun") if name in before}
     earlier = before["machines"] if before.get("versions") == facts["versions"] else []
-    with replaced(path) as partial:
-        machines = list(dict.fromkeys([*earlier, processor()]))
-        partial.write_text(json.dumps(facts | {"machines": machines}, indent=2) + "\n")
+    machines = list(dict.fromkeys([*earlier, processor()]))
+    write_text(path, json.dumps(facts | {"machines": machines}, indent=2) + "\n")
 
 
 def _replayed(submission, config: VerifyConfig):

@@ -34,7 +34,7 @@ CUTS = {
 
 def colour_shader() -> ShaderConfig | None:
     """A shader for cameras of which only `rgb` is asked, or None where SAPIEN's is not the one that `CUTS` knows."""
-    source = (PACKS / "minimal" / "gbuffer.frag").read_text()
+    source = (PACKS / "minimal" / "gbuffer.frag").read_text(encoding="utf-8")
     if not all(text in source for text in CUTS):
         return None
     for text, replacement in CUTS.items():
@@ -56,4 +56,4 @@ def _build(source: str, folder: Path) -> None:
     (folder / "colour").mkdir()
     for name in ("gbuffer.vert", "shadow.vert"):
         shutil.copy(PACKS / "minimal" / name, folder / "colour")
-    (folder / "colour" / "gbuffer.frag").write_text(source)
+    (folder / "colour" / "gbuffer.frag").write_text(source, encoding="utf-8")

@@ -5,16 +5,18 @@ has one row for every run that failed or has not been made.
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, TypedDict
 
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.tables import with_later_columns
+from lerobot_constructskill.artifacts.tables import VERSIONS, Table
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.files import Json, Yaml
 
 STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
 """Files in a study's folder: the study as it was read, its rows, and what is known of how they were made."""
@@ -24,6 +26,43 @@ VARIANT, REFERENCE, SIGHTLESS = "variant", "reference", "sightless"
 
 NOT_RUN = "not_run"
 """`error_kind` of a run that has not been made; any other kind is that of an exception (`errors.kind`)."""
+
+
+LATER = ("clipped_steps",)
+"""Columns that tables of before 2026-11-26 do not have."""
+
+ERRORS = Json("held-out errors in m2, data set to error", dict[str, float])
+
+
+class _Known(TypedDict, total=False):
+    machine: str
+
+
+KNOWN = Json("what is known of a study's making", _Known)
+"""Of the file `PROVENANCE`."""
+
+
+class _Environment(TypedDict):
+    env: dict[str, Any]
+
+
+class _Settings(TypedDict):
+    settings: dict[str, _Environment]
+
+
+SETTINGS = Yaml("a study's file", _Settings)
+
+
+def read_environments(root: Path) -> dict[str, dict[str, Any]]:
+    """How a study's folder says that each of its settings is evaluated: fields of `--env.type=constructskill`.
+
+    Raises:
+        InputError: its file is not a study's.
+    """
+    envs = {name: of["env"] for name, of in SETTINGS.read(root / STUDY)["settings"].items()}
+    if bare := [name for name, env in envs.items() if not isinstance(env.get("task"), str)]:
+        raise InputError(f"'{root / STUDY}' does not say of its setting '{bare[0]}' what env.task is.")
+    return envs
 
 
 def check_folder(root: Path) -> None:
@@ -112,20 +151,20 @@ class Row(EpisodeRow):
     video: str | None = None
 
 
-_ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-
-
-def _schema(kind: type) -> pa.Schema:
-    return pa.schema([(field.name, _arrow_type(field.type)) for field in fields(kind)])
-
-
-def _arrow_type(annotation: type) -> pa.DataType:
-    return next(arrow for kind, arrow in _ARROW.items() if kind in getattr(annotation, "__args__", (annotation,)))
+TABLES = {
+    EpisodeRow: Table("a table of a run's rows", EpisodeRow, later=LATER, json={"versions": VERSIONS}),
+    Row: Table(
+        "a table of a study's rows",
+        Row,
+        later=LATER,
+        json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS},
+    ),
+}
 
 
 def write_rows(rows: Iterable[EpisodeRow], path: Path, kind: type[EpisodeRow] = Row) -> None:
     """Write `rows`, all of one `kind`, to a parquet file, which appears whole or not at all."""
-    table = pa.Table.from_pylist([asdict(row) for row in rows], schema=_schema(kind))
+    table = pa.Table.from_pylist([asdict(row) for row in rows], schema=TABLES[kind].schema)
     with replaced(path) as partial:
         pq.write_table(table, partial)
 
@@ -136,23 +175,12 @@ def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
     Raises:
         InputError: the file does not hold such rows.
     """
-    return _read(path, kind).to_pandas(types_mapper=_nullable)
+    return TABLES[kind].read(path).to_pandas(types_mapper=_nullable)
 
 
 def load_rows[Kind: EpisodeRow](path: Path, kind: type[Kind] = Row) -> list[Kind]:
     """Read the same as objects. Raises as `read_rows` does."""
-    return [kind(**row) for row in _read(path, kind).to_pylist()]
-
-
-def _read(path: Path, kind: type[EpisodeRow]) -> pa.Table:
-    try:
-        table = pq.read_table(path)
-    except pa.ArrowInvalid as error:
-        raise InputError(f"'{path}' cannot be read: {error}") from None
-    table = with_later_columns(table, _schema(kind), ("clipped_steps",))
-    if not table.schema.equals(_schema(kind)):
-        raise InputError(f"'{path}' is not a table of a study's rows in this version's form.")
-    return table
+    return [kind(**row) for row in TABLES[kind].read(path).to_pylist()]
 
 
 def _nullable(kind: pa.DataType):

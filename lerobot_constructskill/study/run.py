@@ -11,7 +11,7 @@ from itertools import batched, groupby
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.artifacts.processor import processor
@@ -20,7 +20,7 @@ from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.execute import Job, make_runs
-from lerobot_constructskill.study.rows import PROVENANCE, STUDY
+from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY
 from lerobot_constructskill.study.runs import Run, list_runs
 from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
@@ -49,8 +49,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
     with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
         table = Table(root, runs, store)
         _check_nothing_is_lost(table)
-        with replaced(root / STUDY) as partial:
-            partial.write_text(text)
+        write_text(root / STUDY, text)
         for run in table.failed() if options.retry_failed else []:
             if run in chosen:
                 table.forget_failure(run)
@@ -143,11 +142,7 @@ def _provenance(root: Path) -> dict[str, Any]:
         InputError: it is damaged, or says of seconds what is no number.
     """
     path = root / PROVENANCE
-    try:
-        facts = json.loads(path.read_text()) if path.exists() else {}
-        facts["machine"] = str(facts.get("machine", ""))
-    except (ValueError, TypeError, AttributeError):
-        raise InputError(f"'{path}' is not a study's provenance: put it back as it was, or move it away.") from None
+    facts = {"machine": ""} | (KNOWN.read(path) if path.exists() else {})
     if bad := [name for name, value in facts.items() if name.endswith(", s") and not isinstance(value, int | float)]:
         raise InputError(f"'{path}': '{bad[0]}' must be a number of seconds, not {facts[bad[0]]!r}.")
     return facts
@@ -168,5 +163,4 @@ def _write_provenance(root: Path, earlier: dict[str, Any], before: dict[str, flo
         **{name: round(earlier.get(name, 0) + seconds) for name, seconds in this.items()},
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
     }
-    with replaced(root / PROVENANCE) as partial:
-        partial.write_text(json.dumps(facts, indent=2) + "\n")
+    write_text(root / PROVENANCE, json.dumps(facts, indent=2) + "\n")

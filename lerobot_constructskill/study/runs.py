@@ -34,6 +34,9 @@ from lerobot_constructskill.training.checkpoints import (
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import versions_of
 
+OURS = "constructskill"
+"""The one environment that a study evaluates in."""
+
 SEEDS_APART = 2_000
 """From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
 
@@ -180,6 +183,9 @@ def list_runs(study: Study) -> list[Run]:
             env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
         evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
+        starts = range(study.eval_seed, study.eval_seed + study.episodes)
+        for data in sets.values():
+            check_apart({f"demonstrations '{data.name}'": data.config.starts, "evaluation": starts})
         common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
             for seeds, drawn in _draws(study, range(count), sets):
@@ -276,7 +282,9 @@ def _training_of(study: Study, setting: str, name: str, variant: Variant) -> Tra
 
 def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
-    env = decode(EnvConfig, {**fields, "type": "constructskill"}).gym_kwargs
+    if fields.get("type", OURS) != OURS:
+        raise InputError(f"type must be {OURS}, not {fields['type']!a}: a study evaluates in no other environment.")
+    env = decode(EnvConfig, {**fields, "type": OURS}).gym_kwargs
     task = get_task(env["task"])  # one: a setting is no suite
     length = env["episode_length"] or task.horizon
     light_robot, backend = resolve_rendering(env["light_robot"], env["render_backend"])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
-from lerobot_constructskill.bounds import Among, Count, Pattern, Seed, Workers, check, check_values
+from lerobot_constructskill.bounds import Among, Count, Pattern, Range, Seed, Text, Workers, check, check_values
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.training.recipe import Training
 
@@ -16,6 +16,9 @@ NAME = r"[a-z0-9][a-z0-9_-]*"
 
 SHARED, OWN = "shared", "own"
 """Whether all training seeds learn from the same demonstrations, or each from its own."""
+
+
+Seeds = Annotated[int, Range(1, 1000)]
 
 
 @dataclass(frozen=True)
@@ -29,7 +32,7 @@ class Setting:
         training: fields of `Training` that differ from the study's.
     """
 
-    data: str
+    data: Text
     env: dict[str, Any] = field(default_factory=dict)
     training: dict[str, Any] = field(default_factory=dict)
 
@@ -52,9 +55,9 @@ class Variant:
     """
 
     policy: dict[str, Any]
-    seeds: Count = 10
-    data: str | None = None
-    dagger: str | None = None
+    seeds: Seeds = 10
+    data: Text | None = None
+    dagger: Text | None = None
     settings: list[str] | None = None
     training: dict[str, Any] = field(default_factory=dict)
     first_seed: Seed = 0
@@ -108,6 +111,8 @@ class Study:
             )
         for name, seeds in self.references.items():
             check_values(Variant, {"seeds": seeds}, f"references.{name}: ")
+        for name, setting in self.settings.items():
+            check(setting, f"settings.{name}.")
         for name, variant in self.variants.items():
             check(variant, f"variants.{name}.")
             unknown = [setting for setting in variant.settings or [] if setting not in self.settings]

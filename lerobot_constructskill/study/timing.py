@@ -5,13 +5,25 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import NotRequired, TypedDict
+
+from lerobot_constructskill.files import Json, read_bytes
 
 TIMINGS = "timings.jsonl"
 
 DEMONSTRATIONS, TRAINING, EVALUATION = "demonstrations", "encoding and training", "evaluation"
 ROUNDS = "rounds of DAgger"
 """The stages of a study; with rounds, training is part of them."""
+
+
+class _Entry(TypedDict):
+    stage: str
+    seconds: float
+    arm: NotRequired[str]
+    runs: NotRequired[int]
+
+
+ENTRY = Json("the time of a piece of work", _Entry)
 
 
 @contextmanager
@@ -26,7 +38,9 @@ def timed(root: Path, stage: str, arm: str | None = None, runs: int = 1) -> Iter
     yield
     spent = {"stage": stage, "seconds": round(time.monotonic() - start, 1)}
     line = json.dumps(spent | ({"arm": arm, "runs": runs} if arm else {}))
-    with (root / TIMINGS).open("a") as file:  # one short write: processes that append at once do not mix
+    with (root / TIMINGS).open(
+        "a", encoding="utf-8"
+    ) as file:  # one short write: processes that append at once do not mix
         file.write(line + "\n")
 
 
@@ -47,8 +61,8 @@ def seconds_per_run(root: Path) -> dict[str, dict[str, float]]:
     return took
 
 
-def _entries(root: Path) -> Iterator[dict[str, Any]]:
+def _entries(root: Path) -> Iterator[_Entry]:
     file = root / TIMINGS
-    for line in file.read_text().splitlines() if file.exists() else []:
+    for line in read_bytes(file).splitlines() if file.exists() else []:
         with suppress(ValueError):  # a line that a full disk or a power cut tore
-            yield json.loads(line)
+            yield ENTRY.parse(line.decode(), f"A line of '{file}'")

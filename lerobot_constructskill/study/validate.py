@@ -8,6 +8,7 @@ from dataclasses import replace
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.heldout import heldout_mse
 from lerobot_constructskill.study.runs import Arm, Demonstrations, Run
@@ -15,6 +16,8 @@ from lerobot_constructskill.training.checkpoints import read_facts
 from lerobot_constructskill.training.trainers import trainer_of
 
 FILE = "heldout.json"
+
+ERROR = Json("a held-out error", dict[str, float])
 
 logger = logging.getLogger(__name__)
 
@@ -61,7 +64,7 @@ def read_error(run: Run, data: Demonstrations, store: Store) -> float | None:
     if told is not None:
         return told
     made = run.heldout(data)
-    return json.loads((store.folder(made) / FILE).read_text())["mse_m2"] if store.has(made) else None
+    return ERROR.read(store.folder(made) / FILE)["mse_m2"] if store.has(made) else None
 
 
 def _is_known(run: Run, data: Demonstrations, store: Store) -> bool:
@@ -81,4 +84,4 @@ def _measure(arm: Arm, runs: Sequence[Run], data: Demonstrations, store: Store, 
         for run, error in zip(runs, errors, strict=True):
             with store.writing(run.heldout(data)) as folder:
                 folder.mkdir()
-                (folder / FILE).write_text(json.dumps({"mse_m2": error}) + "\n")
+                (folder / FILE).write_text(json.dumps({"mse_m2": error}) + "\n", encoding="utf-8")

@@ -5,17 +5,17 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.utils import OBS_STATE
 
 from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
@@ -28,6 +28,14 @@ ACTING = (*LEARNING, "mani_skill", "sapien")
 
 FACTS = "training.json"
 """In a checkpoint's folder: what its trainer says of it."""
+
+
+class _Facts(TypedDict, total=False):
+    heldout_mse_m2: float | None
+    made_of: dict[str, str]
+
+
+SAID = Json("what a trainer says of a checkpoint", _Facts)
 
 
 def settle_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
@@ -75,13 +83,13 @@ def writing_checkpoint(store: Store, checkpoint: Artifact, policy: PreTrainedCon
     Raises:
         MachineError: the policy's code is not what it was when the checkpoint was asked for.
     """
-    with store.writing(checkpoint) as folder, room_for(folder):
+    with store.writing(checkpoint) as folder:
         yield folder
         check_unedited(checkpoint.spec["versions"], versions_of(policy))
-        (folder / FACTS).write_text(json.dumps(facts) + "\n")
+        (folder / FACTS).write_text(json.dumps(facts) + "\n", encoding="utf-8")
 
 
-def read_facts(checkpoint: Path) -> dict:
-    """What a checkpoint says of its training."""
+def read_facts(checkpoint: Path) -> _Facts:
+    """What a checkpoint says of its training. Raises InputError where its file is damaged."""
     file = checkpoint / FACTS
-    return json.loads(file.read_text()) if file.exists() else {}
+    return SAID.read(file) if file.exists() else {}

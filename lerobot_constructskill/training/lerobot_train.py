@@ -89,10 +89,10 @@ def _call(command: list[str], log: Path) -> None:
         MachineError: it, or a process of its own, was killed or ran out of memory.
         Each has as its note all that was printed.
     """
-    with log.open("w") as file:
+    with log.open("w", encoding="utf-8") as file:
         done = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, preexec_fn=be_killed_with_parent)
     if done.returncode:
-        said = log.read_text(errors="replace")
+        said = log.read_text(encoding="utf-8", errors="replace")
         error = _judge(done.returncode, said)
         error.add_note(said)
         raise error

@@ -1,11 +1,15 @@
 """Folders that appear whole or not at all."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from lerobot_constructskill.artifacts.folders import MARK, staged
+from lerobot_constructskill.artifacts import disk
+from lerobot_constructskill.artifacts.folders import MARK, replaced, staged
+from lerobot_constructskill.errors import MachineError
 
 
 def test_a_folder_appears_when_it_is_complete(tmp_path):
@@ -101,3 +105,74 @@ def test_a_failure_without_finished_parts_leaves_nothing(tmp_path):
     with pytest.raises(KeyboardInterrupt), staged(tmp_path / "set", keep="parts"):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
+
+
+CONTAINER = """
+import os, sys
+from pathlib import Path
+from lerobot_constructskill.artifacts.folders import replaced
+os.getpid = lambda: 2**30  # of another container, which has its own numbers and the same name
+with replaced(Path(sys.argv[1])) as partial:
+    partial.write_text("theirs")
+    print("writing", flush=True)
+    sys.stdin.readline()
+"""
+
+
+def test_a_file_that_another_container_is_writing_is_left_alone(tmp_path):
+    path = tmp_path / "rows.txt"
+    theirs = subprocess.Popen(
+        [sys.executable, "-c", CONTAINER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert theirs.stdout.readline() == "writing\n"
+    with replaced(path) as partial:
+        partial.write_text("ours")
+    assert path.read_text() == "ours"
+    theirs.communicate("go on\n")
+    assert theirs.returncode == 0 and path.read_text() == "theirs" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_a_killed_process_was_writing_is_removed_by_the_next(tmp_path):
+    path = tmp_path / "rows.txt"
+    killed = subprocess.Popen(
+        [sys.executable, "-c", CONTAINER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    killed.stdout.readline()
+    killed.kill()
+    killed.communicate()
+    assert len(list(tmp_path.iterdir())) == 1 and not path.exists()
+    with replaced(path) as partial:
+        partial.write_text("ours")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_root_of_all_folders_exists():
+    with pytest.raises(FileExistsError, match="The output folder / exists already"), staged(Path("/")):
+        pass
+
+
+@pytest.mark.parametrize("writing", [replaced, staged])
+def test_a_full_disk_is_one_sentence_with_its_path_whoever_writes(writing, tmp_path):
+    with pytest.raises(MachineError, match=f"^The disk of {tmp_path} is full"), writing(tmp_path / "new"):
+        Path("/dev/full").write_text("x")
+    with pytest.raises(MachineError, match=f"^The disk of {tmp_path} is full"), writing(tmp_path / "new"):
+        raise OSError("Not enough free space to write 21626880 bytes")  # as NumPy says it
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("writing", [replaced, staged])
+def test_the_room_is_measured_before_what_took_it_is_removed(writing, tmp_path, monkeypatch):
+    """Stands in for a disk that what was written has filled."""
+    free = lambda path: type("Usage", (), {"free": 0 if list(tmp_path.rglob("*new*")) else 10**9})  # noqa: E731
+    monkeypatch.setattr(disk.shutil, "disk_usage", free)
+    with pytest.raises(MachineError, match="is full"), writing(tmp_path / "new") as path:
+        path.touch()
+        raise OSError("7150080 requested and 1572800 written")  # as np.save says it
+
+
+def test_a_full_disk_of_temporary_files_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    free = lambda path: type("Usage", (), {"free": 0 if path == tmp_path else 10**9})  # noqa: E731
+    monkeypatch.setattr(disk.shutil, "disk_usage", free)
+    with pytest.raises(MachineError, match=f"^The disk of {tmp_path} is full"), disk.room_for(Path("/elsewhere")):
+        raise RuntimeError("av: 28")

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from html.parser import HTMLParser
 from pathlib import Path
 
+import hostile
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -74,7 +75,7 @@ def many(valid, tmp_path_factory):
 
 def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
     pages = {path.stem: Page(path.read_text()) for path in write_board(BOARD, tmp_path, "alice/bench")}
-    entries = read_entries(BOARD)
+    entries, _ = read_entries(BOARD)
     others = json.loads((tmp_path / "exports" / "leaderboard.json").read_text())
     assert entries and pages.keys() == {"index", *SUITES}
     for entry in entries:
@@ -96,7 +97,7 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
 
 
 def test_ranks_are_of_seeds_and_ties_are_ties(many):
-    claimed = read_entries(many)
+    claimed, _ = read_entries(many)
     assert ranks(claimed, "block_to_bin") == {}, "an unchecked entry would push others down"
     entries = [replace(entry, level="replayed") for entry in claimed]
     assert ranks(entries, "block_to_bin") == {"good": (1, False), "bad": (2, False)}
@@ -116,7 +117,9 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
 
 
 def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
-    entries = [replace(entry, level=level) for entry in read_entries(BOARD) for level in ("claimed", "replayed")]
+    entries = [
+        replace(entry, level=level) for entry in read_entries(BOARD).entries for level in ("claimed", "replayed")
+    ]
     standard = {entry.name for entry in entries if entry.said.settings_class == "standard" and not entry.is_reference}
     write_exports(entries[1::2], tmp_path, "today", "alice/bench")
     assert {path.parts[-3] for path in tmp_path.glob("exports/*/.eval_results/*")} == standard != set()
@@ -140,7 +143,9 @@ def test_of_an_entry_that_was_withdrawn_no_export_stays_and_what_is_somebody_els
 def test_an_entry_that_is_being_written_is_not_read(many, tmp_path):
     board = shutil.copytree(many, tmp_path / "board")
     (board / "entries" / "new.partial").mkdir()
-    assert [entry.name for entry in read_entries(board)] == [entry.name for entry in read_entries(many)]
+    assert [entry.name for entry in read_entries(board).entries] == [
+        entry.name for entry in read_entries(many).entries
+    ]
 
 
 def test_of_two_verdicts_at_once_none_is_lost(tmp_path, monkeypatch):
@@ -173,26 +178,40 @@ def test_what_a_stranger_writes_is_text(many, tmp_path):
 def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     root = tmp_path / "board"
     shutil.copytree(many, root)
-    entry = read_entries(root)[0]
+    entry = read_entries(root).entries[0]
     (root / "verified").mkdir()
     path = root / "verified" / f"{entry.name}.json"
     verdict = {"submission": entry.submission.sha256, "level": "replayed", "versions": {"sapien": "3"}, "date": ""}
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
-        assert read_entries(root)[0].level == level
+        assert read_entries(root).entries[0].level == level
     path.write_text('{"level": "best"}')
-    with pytest.raises(InputError, match="not a verdict"):
-        read_entries(root)
+    assert "is not a verdict of constructskill-verify: submission: it is missing" in read_entries(root).refused[0]
     path.unlink()
     declaration = root / "entries" / entry.name / "submission.yaml"
     declaration.write_text(declaration.read_text().replace("version: 1", "version: 7"))
-    with pytest.raises(InputError, match=f"^Entry '{entry.name}': .*version"):
-        read_entries(root)
     (root / "entries" / "No Name").mkdir()
-    with pytest.raises(InputError, match="called by a name"):
-        read_entries(root)
+    no_name, version = read_entries(root).refused
+    assert "Entry 'No Name': the folder of an entry must be called by a name" in no_name
+    assert version.startswith(f"Entry '{entry.name}': ") and "version" in version
     with pytest.raises(MissingError, match="is not a board"):
         read_entries(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("file", ["entries/bad/submission.yaml", "entries/bad/episodes.parquet", "verified/bad.json"])
+def test_a_file_of_one_entry_stops_no_other(file, many, tmp_path):
+    root = shutil.copytree(many, tmp_path / "board")
+    (root / "verified").mkdir()
+    for way, damage in hostile.WAYS.items():
+        damage(root / file)
+        entries, refused = read_entries(root)
+        assert len(refused) == 1 and refused[0].startswith("Entry 'bad': ") and "\n" not in refused[0], way
+        assert {entry.name for entry in entries} >= {"good", "few"}
+        shutil.rmtree(root / file) if way == "a folder" else (root / file).unlink()
+    (root / file).write_text("[")
+    with pytest.raises(InputError, match="^The board in .* is without what cannot be read. Entry 'bad': "):
+        write_board(root, tmp_path / "site")
+    assert "good" in Page((tmp_path / "site" / "bins.html").read_text()).found["id"]
 
 
 def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
@@ -240,7 +259,7 @@ def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypa
 
 
 def test_rewards_are_those_of_the_environment():
-    expert = next(entry for entry in read_entries(BOARD) if entry.name == "bins_expert")
+    expert = next(entry for entry in read_entries(BOARD).entries if entry.name == "bins_expert")
     info = eval_info(expert, 0)
     assert info["overall"]["n_episodes"] == 101 and info["overall"]["pc_success"] == 100
     (fixed,) = expert.standings["brick_to_bin"].claims[0]
@@ -250,6 +269,6 @@ def test_rewards_are_those_of_the_environment():
 
 
 def test_an_episode_that_failed_with_an_error_has_no_reward(many):
-    bad = next(entry for entry in read_entries(many) if entry.name == "bad")
+    bad = next(entry for entry in read_entries(many).entries if entry.name == "bad")
     (task,) = eval_info(bad, 0)["per_task"]
     assert task["metrics"]["max_rewards"][0] == task["metrics"]["sum_rewards"][0] == 0

@@ -198,7 +198,10 @@ def test_what_a_study_does_not_have_is_said(study, tmp_path):
     with pytest.raises(MissingError, match="not run block/ours/seed_0 yet"):
         collected(Row(run="d9", **FACTS, error_kind=NOT_RUN))
     (study / STUDY).write_text("settings: {block: {}}")
-    with pytest.raises(InputError, match="does not say env.task"):
+    with pytest.raises(InputError, match="is not a study's file: settings.block.env: it is missing"):
+        collected(row)
+    (study / STUDY).write_text("settings: {block: {env: {}}}")
+    with pytest.raises(InputError, match="does not say of its setting 'block' what env.task is"):
         collected(row)
     (study / STUDY).unlink()
     with pytest.raises(MissingError, match="study.yaml is missing"):

@@ -134,7 +134,7 @@ def emptied(root, file, change):
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
-        ("meta/stats.json", lambda stats: stats.update(action=[]), "for each name of action"),
+        ("meta/stats.json", lambda stats: stats.update(action=[]), "action: Input should be an object"),
         ("meta/stats.json", lambda stats: stats["action"].update(q01=None), "for each name of action"),
         (
             "meta/stats.json",

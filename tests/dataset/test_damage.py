@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import hostile
 import pytest
 
 from lerobot_constructskill.dataset.card import card_facts
@@ -19,19 +20,11 @@ JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
 BINARY = ("meta/tasks.parquet", "data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4")
 
 
-def truncate(path: Path) -> None:
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-
-
 WAYS: dict[str, Callable[[Path], object]] = {
-    "truncated": truncate,
-    "empty": lambda path: path.write_bytes(b""),
+    "truncated": hostile.truncate,
+    "empty": hostile.WAYS["empty"],
     "gone": Path.unlink,
-    "a list": lambda path: path.write_text("[]"),
-    "an empty object": lambda path: path.write_text("{}"),
-    "null": lambda path: path.write_text("null"),
-    "text": lambda path: path.write_text('"x"'),
+    **hostile.WAYS,
 }
 CASES = [(pattern, way) for pattern in JSON for way in WAYS] + [(p, way) for p in BINARY for way in list(WAYS)[:3]]
 

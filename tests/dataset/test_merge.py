@@ -24,13 +24,13 @@ def test_what_lerobot_keeps_of_episodes_is_what_it_is_given(pristine):
 
 def test_statistics_are_of_one_column_after_another(pristine, monkeypatch):
     """All of them at once would not fit: a long set's columns are gigabytes."""
-    read, asked = merge.pd.read_parquet, []
+    read, asked = merge.read_parquet, []
 
     def note(path, columns):
         asked.append(columns)
-        return read(path, columns=columns)
+        return read(path, columns)
 
-    monkeypatch.setattr(merge.pd, "read_parquet", note)
+    monkeypatch.setattr(merge, "read_parquet", note)
     statistics = merge.frame_statistics(pristine)
     assert asked == [[name] for name in statistics]
 

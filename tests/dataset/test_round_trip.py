@@ -69,7 +69,9 @@ def test_outcomes_are_counted_by_stage_and_seed(tmp_path):
     for seed, stages in ((10, [0.5, 1.0, 0.0]), (2, [0.0])):
         folder = tmp_path / f"seed_{seed}"
         folder.mkdir()
-        (folder / "eval_info.json").write_text(json.dumps({"per_task": [{"metrics": {"max_rewards": stages}}]}))
+        metrics = {"successes": [stage == 1 for stage in stages], "max_rewards": stages}
+        told = {"per_task": [{"task_group": "loose", "task_id": 0, "metrics": metrics}]}
+        (folder / "eval_info.json").write_text(json.dumps(told))
     assert seed_outcomes(tmp_path) == [(2, 0, 0, 1), (10, 2, 1, 3)]
     with pytest.raises(FileNotFoundError, match="lerobot-eval"):
         seed_outcomes(tmp_path / "seed_2")

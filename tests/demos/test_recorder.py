@@ -205,7 +205,7 @@ def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
         (["--workers=0"], "workers"),
         (["--episodes=0"], "episodes"),
         (["--obs_type=rgb"], "pixels_agent_pos"),
-        (["--config_path=/dev/null"], "empty"),
+        (["--config_path=/dev/null"], "'/dev/null' is not a regular file."),
     ],
 )
 def test_the_command_answers_bad_input_in_one_sentence(flags, words, tmp_path):

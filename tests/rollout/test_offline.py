@@ -212,8 +212,9 @@ def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_pa
     (tmp_path / "features" / "meta").mkdir(parents=True)
     (tmp_path / "copy" / "data").mkdir(parents=True)
     (tmp_path / "copy" / "data" / "file").write_text("frames")
-    column = {"info": {"source_repo_id": "alice/set", "source_sha256": data_sha256(tmp_path / "copy")}}
-    described = {"features": {"observation.features.base": column, "action": {"info": None}, "index": {}}}
+    plain = {"dtype": "float32", "shape": [1]}
+    column = plain | {"info": {"source_repo_id": "alice/set", "source_sha256": data_sha256(tmp_path / "copy")}}
+    described = {"features": {"observation.features.base": column, "action": plain | {"info": None}, "index": plain}}
     (tmp_path / "features" / "meta" / "info.json").write_text(json.dumps(described))
     told = {
         "repo_id": "alice/set_encoded",
@@ -237,7 +238,7 @@ def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_pa
 def test_of_a_checkpoint_that_says_nothing_of_its_training_set_a_line_is_said(tmp_path, monkeypatch, caplog):
     home = tmp_path / "home"
     (home / "alice" / "encoded" / "meta").mkdir(parents=True)
-    column = {"info": {"source_repo_id": "alice/set", "source_sha256": "0"}}
+    column = {"dtype": "float32", "shape": [1], "info": {"source_repo_id": "alice/set", "source_sha256": "0"}}
     (home / "alice" / "encoded" / "meta" / "info.json").write_text(json.dumps({"features": {"a": column}}))
     monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", home)
     asked = SimpleNamespace(repo_id="alice/set", num_episodes=16, root=tmp_path / "nothing")

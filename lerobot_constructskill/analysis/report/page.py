@@ -9,7 +9,6 @@ from pathlib import Path
 
 import draccus
 import pandas as pd
-import yaml
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -21,7 +20,9 @@ from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
 from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wrong_order
+from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.files import Yaml, read_text
 from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, check_folder, read_rows
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -35,6 +36,8 @@ WORDS = (
     *(plural, wording.seeds, wording.seed_spans),
 )
 """What templates may call as filters."""
+
+STUDY_FILE = Yaml("a study's file")
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ def write_report(root: Path) -> Path:
     findings = collect(heading.analysis, rows)
     context = {
         "name": heading.name,
-        "study": (root / STUDY).read_text(),
+        "study": read_text(root / STUDY),
         "findings": findings,
         "status": status(findings),
         "sections": _sections(root, findings, rows),
@@ -77,7 +80,7 @@ def write_report(root: Path) -> Path:
         "version": metadata.version("lerobot_env_constructskill"),
     }
     for file, environment in (("report.md", _environment(finalize=_escape_markdown)), ("report.html", _environment())):
-        (root / file).write_text(environment.get_template(file).render(numbers=_numbers(), **context))
+        write_text(root / file, environment.get_template(file).render(numbers=_numbers(), **context))
     return root / "report.html"
 
 
@@ -88,13 +91,11 @@ def read_study(root: Path) -> tuple[Heading, pd.DataFrame]:
 
 
 def _read_heading(path: Path) -> Heading:
+    study = STUDY_FILE.read(path)
+    known = {key: study[key] for key in ("name", "analysis") if study.get(key) is not None}
     try:
-        study = yaml.safe_load(path.read_text())
-        if not isinstance(study, dict):
-            raise InputError("it holds no mapping of fields.")
-        known = {key: study[key] for key in ("name", "analysis") if study.get(key) is not None}
         return draccus.decode(Heading, known)
-    except (InputError, yaml.YAMLError, draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
+    except (InputError, draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
         reason = error.__cause__ if isinstance(error.__cause__, InputError) else error  # draccus tells its own alone
         raise InputError(f"'{path}' is not a study's file: {reason}") from None
 

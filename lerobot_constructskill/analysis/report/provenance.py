@@ -9,7 +9,7 @@ from urllib.parse import quote
 import pandas as pd
 
 from lerobot_constructskill.analysis.report.findings import SettingFindings
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study.rows import KNOWN
 
 INLINED = 2 * 1024**2
 """Bytes up to which a video is part of the page."""
@@ -73,15 +73,8 @@ def extra_facts(path: Path) -> list[tuple[str, str]]:
     Raises:
         InputError: the file is not a JSON object.
     """
-    if not path.is_file():
-        return []
-    try:
-        facts = json.loads(path.read_text())
-    except ValueError:
-        facts = None
-    if not isinstance(facts, dict):
-        raise InputError(f"'{path}' must hold one JSON object of names and values.")
-    return [(str(name).replace("_", " "), str(value)) for name, value in facts.items()]
+    facts = KNOWN.read(path) if path.exists() else {}
+    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
 
 
 def _versions(rows: pd.DataFrame) -> list[tuple[str, str]]:

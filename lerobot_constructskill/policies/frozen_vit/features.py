@@ -7,11 +7,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
 
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, first_line
+from lerobot_constructskill.files import read_parquet
+from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 
 from .backbone import IMAGE_SIZE, Backbone
 from .precision import PRECISIONS, RUNTIMES
@@ -22,9 +23,6 @@ POINT_PREFIX = "observation.points."
 
 PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
-
-INFO = "meta/info.json"
-"""LeRobot's description of a data set's columns."""
 
 BOUND = "patches_sha256"
 """Name in the description of a feature column: `_identity` of the patch features beside it."""
@@ -62,10 +60,10 @@ def open_patches(root: Path) -> Tensor:
 def bind_patches(root: Path) -> None:
     """Write into a feature set's description which patch features are its own."""
     path = root / INFO
-    info = json.loads(path.read_text())
+    info = DATA_SET.read(path)
     key = _described_in(info)
     info["features"][key]["info"][BOUND] = _identity(root, key, np.load(root / PATCHES_FILE, mmap_mode="r"))
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False))
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def close_patches() -> None:
@@ -75,9 +73,12 @@ def close_patches() -> None:
 
 @cache
 def _mapped(root: Path) -> Tensor:
-    info = json.loads((root / INFO).read_text())
+    info = DATA_SET.read(root / INFO)
     key = _described_in(info)
-    patches = np.load(root / PATCHES_FILE, mmap_mode="c")  # torch takes no read-only memory
+    try:
+        patches = np.load(root / PATCHES_FILE, mmap_mode="c")  # torch takes no read-only memory
+    except (ValueError, EOFError) as error:
+        raise InputError(f"'{root / PATCHES_FILE}' is damaged ({first_line(error)}).") from None
     if info["features"][key]["info"].get(BOUND) != _identity(root, key, patches):
         raise InputError(
             f"{root / PATCHES_FILE} is not of this feature set's {info['total_frames']} frames, or was written before "
@@ -101,7 +102,7 @@ def _described_in(info: Mapping) -> str:
 def _identity(root: Path, key: str, patches: np.ndarray) -> str:
     """What no other set has: the pooled features of all frames, and some rows of their patch features."""
     files = sorted((root / "data").glob("*/*.parquet"))
-    pooled = np.concatenate([np.stack(pd.read_parquet(file, columns=[key])[key]) for file in files])
+    pooled = np.concatenate([np.stack(read_parquet(file, [key]).to_pandas()[key]) for file in files])
     total = hashlib.sha256(f"{pooled.shape} {patches.shape}".encode())
     total.update(pooled.tobytes())
     for row in np.linspace(0, len(patches) - 1, num=16, dtype=int):

@@ -1,6 +1,5 @@
 """The reference policy of the paper: a frozen encoder, two linear heads, overlapping chunks."""
 
-import json
 import logging
 from collections import deque
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
@@ -276,7 +276,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _check_inputs(self, path: Path) -> None:
         """Refuse what would make other numbers of the same shape of the heads' input or output than in training."""
-        saved = json.loads(path.read_text()) if path.is_file() else {}
+        saved = Json("a policy's configuration").read(path) if path.is_file() else {}
         for name in ("backbone", "readout", "crop", "blind", "gripper_head", "action_scale"):
             asked = getattr(self.config, name)
             asked = list(asked) if isinstance(asked, tuple) else asked
