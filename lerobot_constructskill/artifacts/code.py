@@ -1,4 +1,4 @@
-"""What code by others is: its version and a hash of its source, wherever Python finds it. Standard library only.
+"""What code is: of ours the revisions of its rooms, of others' its version and a hash of its source.
 
 A policy in development changes all day and its version does not. So its source stands beside the version in whatever
 is found by a digest.
@@ -15,11 +15,12 @@ from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 
-from lerobot_constructskill.artifacts.digests import file_sha256, installed
+from lerobot_constructskill.artifacts.digests import file_sha256, installed, stamp
+from lerobot_constructskill.artifacts.revisions import PACKAGE, revisions
 from lerobot_constructskill.errors import MachineError
 
 BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
-"""Top-level packages of which the version says enough, LeRobot's and our own among them."""
+"""Top-level packages whose source is not hashed: LeRobot's version says enough, and our own code has revisions."""
 
 _LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$)")
 """Files beside a package's own: hidden ones, bytecode, logs, and what editors leave for as long as a file is open."""
@@ -28,16 +29,17 @@ _LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$
 def code_of(*names: str) -> dict[str, str]:
     """What the code of some modules is, by the name of its distribution.
 
-    LeRobot's code and ours are left out. Other code is told by its version, where it is installed, and by the start of
-    a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the top-level package, meshes and
-    settings too, but for `_LEFT_OUT`; and of packages that it imports and that are of the same distribution, or of
-    none. Other distributions that it imports are not told.
+    LeRobot's code is left out, and ours is told by `revisions`. Other code is told by its version, where it is
+    installed, and by the start of a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the
+    top-level package, meshes and settings too, but for `_LEFT_OUT`; and of packages that it imports and that are of
+    the same distribution, or of none. Other distributions that it imports are not told.
 
     Args:
         names: modules, or classes as `module:class`.
     """
     packages = {re.split(r"[.:]", name)[0] for name in names} - BY_VERSION
-    return dict(_told(package) for package in sorted(packages) if _files(package))
+    ours = revisions(*(name for name in names if re.split(r"[.:]", name)[0] == PACKAGE.name))
+    return ours | dict(_told(package) for package in sorted(packages) if _files(package))
 
 
 def check_unedited(before: Mapping[str, str], now: Mapping[str, str]) -> None:
@@ -68,14 +70,8 @@ def _source_sha256(package: str) -> str:
     for name in sorted(_with_helpers(package)):
         for relative, path in sorted(_files(name).items()):
             total.update(f"{name}/{relative}".encode())
-            total.update(bytes.fromhex(_sha256(*_stamp(path))))
+            total.update(bytes.fromhex(_sha256(*stamp(path))))
     return total.hexdigest()
-
-
-def _stamp(path: Path) -> tuple[Path, int, int]:
-    """A file as it is now: what is known of it holds until its size or its time changes."""
-    status = path.stat()
-    return path, status.st_size, status.st_mtime_ns
 
 
 @cache
@@ -88,7 +84,7 @@ def _with_helpers(package: str) -> set[str]:
     found, unread = {package}, [package]
     while unread:
         for path in _files(unread.pop()).values():
-            imported = _imported(*_stamp(path)) - BY_VERSION - found
+            imported = _imported(*stamp(path)) - BY_VERSION - found
             helpers = {name for name in imported if _distribution(name) in (None, _distribution(package))}
             helpers = {name for name in helpers if _is_written(name)}
             found |= helpers

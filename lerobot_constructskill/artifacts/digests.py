@@ -20,6 +20,12 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def stamp(path: Path) -> tuple[Path, int, int]:
+    """A file as it is now: what is known of it holds until its size or its time changes."""
+    status = path.stat()
+    return path, status.st_size, status.st_mtime_ns
+
+
 def files_below(root: Path, *folders: str) -> Iterator[Path]:
     """Yield the files below some folders of a data set, in the order of their paths.
 

@@ -56,7 +56,7 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
 
 
 def _open_up(folder: Path) -> None:
-    """Let whoever may read a folder read what is in it.
+    """Let whoever may read a folder read what is in it, and have all of it on the disk.
 
     `tempfile`, by which LeRobot joins videos, lets nobody but their owner read files.
     """
@@ -64,6 +64,17 @@ def _open_up(folder: Path) -> None:
     for path in folder.rglob("*"):
         if not path.is_symlink():
             path.chmod(path.stat().st_mode | (access if path.is_dir() else access & 0o666))
+            _to_disk(path)
+    _to_disk(folder)
+
+
+def _to_disk(path: Path) -> None:
+    """Have a file's content, or a folder's names, on the disk: a power cut would leave the new name without it."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def sweep(root: Path) -> None:
@@ -117,6 +128,7 @@ def replaced(path: Path) -> Iterator[Path]:
         try:
             with room_for(path):
                 yield partial
+                _to_disk(partial)
             os.replace(partial, path)
         finally:
             partial.unlink(missing_ok=True)

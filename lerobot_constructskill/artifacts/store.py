@@ -8,6 +8,7 @@ Whatever does not show in an artefact's bytes (labels, paths, numbers of workers
 
 import json
 import logging
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,13 +22,19 @@ from lerobot_constructskill.artifacts.digests import digest
 from lerobot_constructskill.artifacts.folders import staged, sweep
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.errors import InputError, MissingError, TakenError, full_traceback
-from lerobot_constructskill.files import Json
+from lerobot_constructskill.files import Json, read_text
 
 
 class _Spec(TypedDict, total=False):
     seed: int
     training: dict[str, Any]
 
+
+NOTED = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d$")
+"""The line above an exception in a log."""
+
+LONGEST = 1 << 30
+"""Bytes of a log."""
 
 SPEC, LOG = "spec.json", "log.txt"
 
@@ -76,6 +83,10 @@ class Store:
             raise InputError(f"{folder} was not made by this version of the package: move it away.")
         return True
 
+    def spec(self, kind: str, name: str) -> Mapping[str, Any] | None:
+        """The specification of what has this digest; None where it has not been made."""
+        return _read_spec(self.root / kind / name / SPEC)
+
     def keeps(self, kind: str, name: str) -> bool:
         """Whether something of this digest has been made, whatever its specification."""
         return (self.root / kind / name).is_dir()
@@ -114,6 +125,11 @@ class Store:
     def log(self, artifact: Artifact) -> Path:
         """What was said while the artefact was made; in its own folder once it is there."""
         return self.root / "logs" / f"{artifact.kind}-{artifact.digest}.txt"
+
+    def notes(self, artifact: Artifact) -> int:
+        """How many exceptions its log holds while it is not made."""
+        log = self.log(artifact)
+        return sum(map(bool, map(NOTED.match, read_text(log, LONGEST).splitlines()))) if log.exists() else 0
 
     def note(self, artifact: Artifact, error: BaseException) -> None:
         """Add an exception's whole traceback to the log."""

@@ -7,12 +7,11 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from itertools import batched, groupby
 
-from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS, Setting
 from lerobot_constructskill.board.submission import Claim, Submission, is_replayable, width
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import DECIDING, FOLDER, Outcome, deciding
+from lerobot_constructskill.envs.recording import FOLDER, Outcome, deciding
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
@@ -72,7 +71,7 @@ def replay(submission: Submission, workers: int | None = None, sample: int | Non
         failed=len(submission.claims) - len(acted),
         steps=sum(claim.steps for claim in chosen),
         differences=[f"{said}{others}." for said in found],
-        versions=versions(*DECIDING),
+        versions={name: value for name, value in deciding().items() if name != "processor"},
     )
 
 

@@ -5,6 +5,7 @@ from itertools import batched
 from pathlib import Path
 from typing import Any
 
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.comparison.sides import MAKER, Conditions, Side, merge_versions
@@ -44,7 +45,7 @@ def evaluate(
     for group in batched(checkpoints, together):  # noqa: B911  the last one may be smaller
         for checkpoint, agent, rollout in _roll_out(group, env, starts, device):
             seeds.append({episode.evaluation_seed: episode.placed for episode in rollout.episodes})
-            packages = versions(*ACTING) | versions_of(agent.policy.config)
+            packages = versions(*ACTING) | code_of(roll_out.__module__) | versions_of(agent.policy.config)
             told.append(packages | {"processor": processor(), MAKER: make(), "backend": rollout.backend})
             if kept_in is not None:
                 folder = kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}"

@@ -13,7 +13,6 @@ from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_round, totals
-from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
@@ -90,6 +89,5 @@ def _provenance(plan: Plan, number: int, store: Store) -> dict[str, Any]:
         "checkpoint": plan.checkpoint(number - 1).digest,
         "seed_start": plan.seeds(number).start,
         "patience": plan.config.patience,
-        "advice": REVISION,
         **totals(outcomes),
     }

@@ -6,11 +6,11 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Artifact
 from lerobot_constructskill.contract import Task, get_task
 from lerobot_constructskill.dagger.settings import DaggerConfig
-from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
@@ -104,7 +104,6 @@ class Plan:
             "beta": self.config.beta(number),
             "seeds": [self.seeds(number).start, self.config.episodes],
             "expert": vars(self.base.expert),
-            "advice": REVISION,
             "environment": self.env,
             "patience": self.config.patience,
         }
@@ -127,4 +126,4 @@ class Plan:
 
     @cached_property
     def _versions(self) -> dict[str, str]:
-        return versions(*DRIVING) | versions_of(self.policy)
+        return versions(*DRIVING) | code_of(__name__, self.task.scene, self.task.expert) | versions_of(self.policy)

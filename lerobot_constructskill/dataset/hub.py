@@ -174,9 +174,9 @@ def choose_held_out(
 def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     """The episodes of a data set that a checkpoint in a folder says it was trained on, or on their features.
 
-    None if it cannot be told: it lies on the Hub, or its training set is not where it was. Of the episodes that it is
-    given LeRobot keeps the last for its own evaluation, a share `eval_split` rounded up. A study and DAgger say how
-    much they hold out, and not of which folder.
+    None if it cannot be told: it lies on the Hub, or its training set is not where it was. Of the episodes of each
+    task that it is given LeRobot keeps the last for its own evaluation, a share `eval_split` rounded up. A study and
+    DAgger say how much they hold out, and not of which folder.
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
@@ -195,7 +195,11 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     if not is_it:
         return set() if (folder / INFO).is_file() else None
     given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
-    return set(given[: len(given) - ceil(len(given) * (told.get("eval_split") or 0))])
+    tasks: dict[str, list[int]] = {}
+    for episode in given:
+        tasks.setdefault(next(iter(dataset.meta.episodes[episode]["tasks"]), ""), []).append(episode)
+    share = told.get("eval_split") or 0
+    return {episode for own in tasks.values() for episode in own[: len(own) - ceil(len(own) * share)]}
 
 
 def _holds_out_as_the_contract(checkpoint: Path) -> bool:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -47,9 +48,11 @@ def trajectories(data: DataSet, path: Path) -> None:
         corner = [center[i] - extent[i] / 2 for i in (across, up)]
         axis.add_patch(Rectangle(corner, extent[across], extent[up], facecolor="#dddddd", label="bin"))
         for span in spans:
-            for start in range(span.start, span.stop - 1):
-                piece = position[start : start + 2]
-                axis.plot(piece[:, across], piece[:, up], color=COLOURS[Phase(phases[start])], linewidth=0.7)
+            points = position[span][:, [across, up]]
+            pieces = np.stack([points[:-1], points[1:]], axis=1)
+            colours = [COLOURS[Phase(phase)] for phase in phases[span][:-1]]
+            axis.add_collection(LineCollection(pieces, colors=colours, linewidths=0.7))
+        axis.autoscale_view()
         axis.set(xlabel=f"{'xyz'[across]} (m)", ylabel=f"{'xyz'[up]} (m)", aspect="equal", adjustable="datalim")
         axis.set_title(f"{title}, {len(spans)} of {len(data.episodes)} demonstrations", fontsize=10)
     for phase, colour in COLOURS.items():

@@ -10,9 +10,6 @@ from lerobot_constructskill.contract import GRIPPER_OPEN, ROBOT_BASE
 from lerobot_constructskill.demos.expert import Advice, ExpertConfig, Phase, PrivilegedState, Progress
 from lerobot_constructskill.demos.stance import GROUNDED, Stance
 
-REVISION = 2
-"""Raised with every change of what is advised in any state: frames labelled by other advice are another round's."""
-
 OVERHEAD = 0.03
 """Horizontal distance to the grasp within which the hand goes down, in metres."""
 

@@ -10,7 +10,6 @@ from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
 from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
-from lerobot_constructskill.demos.advice import REVISION
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -21,7 +20,7 @@ LABELS = ("clean", "executed", "advice")
 
 Share = Annotated[float, Range(0, 10_000)]
 
-FRAME_PACKAGES = ("lerobot_env_constructskill", "lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
+FRAME_PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
 
 
@@ -113,14 +112,13 @@ def frames_digest(config: GenerateConfig) -> str:
 
 
 def code_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What a data set depends on beside its settings: encoder, columns, versions, and the advice if it labels."""
+    """What a data set depends on beside its settings: encoder, columns, versions and revisions."""
     columns = demonstration_features(get_task(config.task), config.obs_type)
     made_by = frame_versions(config.task)
-    facts = {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": made_by}
-    return facts | ({"advice": REVISION} if config.labels == "advice" else {})
+    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": made_by}
 
 
 def frame_versions(task: str) -> dict[str, str]:
-    """Versions of what makes the frames of a task; of another package's task, the source of its scene and expert."""
+    """What makes the frames of a task: packages, our rooms, and the source of another package's scene and expert."""
     row = get_task(task)
-    return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert)
+    return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert, __name__)

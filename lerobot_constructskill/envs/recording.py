@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
@@ -32,13 +33,13 @@ RECORDINGS = "recordings.parquet"
 STARTING = ("task", "episode_length", "perturb", "perturb_seed", "obs_type")
 """Arguments of `ConstructSkillEnv` that with a seed decide an episode's start, its end and what a policy is shown."""
 
-DECIDING = ("lerobot_env_constructskill", "sapien", "mani_skill", "numpy", "torch")
+DECIDING = ("sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
 
 
 def deciding() -> dict[str, str]:
-    """Their versions here, and the make of the processor: PhysX computes with approximations that are its own."""
-    return versions(*DECIDING) | {"processor": make()}
+    """Their versions here, our revisions, and the make of the processor: PhysX computes with its approximations."""
+    return versions(*DECIDING) | code_of(__name__) | {"processor": make()}
 
 
 @dataclass

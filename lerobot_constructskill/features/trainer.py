@@ -13,6 +13,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils import OBS_STATE
 
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import finished_sha256, versions
 from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.artifacts.store import Artifact, Store
@@ -224,7 +225,7 @@ def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDatas
     made_by = describe(spec, config.backbone_sha256, _precision(config), config.crop, config.blind)
     made_by |= batch_facts(config.device)
     source = {"demonstrations_sha256": finished_sha256(demonstrations.root), "camera": config.camera}
-    made_in = versions("lerobot_env_constructskill", "lerobot", "torch", *FeatureTrainer.packages)
+    made_in = versions("lerobot", "torch", *FeatureTrainer.packages) | code_of(__name__)
     beside = {"patches": readout.reads_patches} | ({"points": [*readout.points]} if readout.points else {})
     return Artifact("features", {**source, **beside, "encoder": made_by, "versions": made_in})
 

@@ -94,6 +94,7 @@ class Reference:
         agent: makes it for a task, a seed of its own and the setting's demonstrations (None unless it reads them).
         reads_demonstrations: whether it does.
         policy: in place of an agent, fields that are set otherwise in the first variant whose policy has them.
+        is_expert: whether the scripted expert acts, whose code then shows in what it does.
         looks: whether it sees the scene; what places without looking shows that a setting does not ask for it.
     """
 
@@ -101,6 +102,7 @@ class Reference:
     agent: Callable[[Task, int, LeRobotDataset | None], Agent] | None = None
     reads_demonstrations: bool = False
     policy: Mapping[str, Any] = field(default_factory=dict)
+    is_expert: bool = False
     looks: bool = True
 
 
@@ -115,5 +117,5 @@ REFERENCES: dict[str, Reference] = {
     ),
     "blind": Reference("Blind policy (constant image)", policy={"blind": True}, looks=False),
     "untrained": Reference("Same ViT, random weights", policy={"backbone_pretrained": False}),
-    "expert": Reference("Scripted expert", lambda task, *_: ExpertAgent(task)),
+    "expert": Reference("Scripted expert", lambda task, *_: ExpertAgent(task), is_expert=True),
 }

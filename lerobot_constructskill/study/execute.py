@@ -41,6 +41,9 @@ EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
 FILMED_SEED = 0
 
+TRIES = 3
+"""Times that the machine may fail a run before that is the run's result."""
+
 ERRNOS = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
 """What an `OSError` says of the machine, its disks and its network."""
 
@@ -54,12 +57,14 @@ class Job:
         store: where everything is made.
         times: folder in which is noted what took how long.
         workers: processes that generate demonstrations and simulate in rounds of DAgger.
+        simulators: processes that simulate episodes; one per core by default.
     """
 
     runs: tuple[Run, ...]
     store: Store
     times: Path
     workers: int = 1
+    simulators: int | None = None
 
 
 def make_runs(job: Job) -> Iterator[Run]:
@@ -91,8 +96,8 @@ def _train(job: Job, runs: Sequence[Run]) -> dict[int, Exception]:
             try:
                 _fit(job, some)
             except Exception as error:  # whatever a policy, its weights or its data set may raise becomes rows
-                _let_through(error)
-                failed |= {run.seed: error for run in some if not job.store.has(run.checkpoint)}
+                lost = [run for run in some if not job.store.has(run.checkpoint)]
+                failed |= dict.fromkeys([run.seed for run in lost], _let_through(job, lost, error))
     return failed
 
 
@@ -104,17 +109,29 @@ def _together(runs: Sequence[Run]) -> Iterator[list[Run]]:
         yield from [seeds] if at_once else ([run] for run in seeds)
 
 
-def _let_through(error: Exception) -> None:
-    """Raise what is no run's fault and may be gone the next time, so that it never stands for the run's result."""
-    if isinstance(error, TakenError | MachineError | MemoryError):
+def _let_through(job: Job, runs: Sequence[Run], error: Exception) -> Exception:
+    """Raise what is no run's fault and may be gone the next time, so that it never stands for the run's result.
+
+    What comes back every time does: after `TRIES` times it is returned, as any other error is, and nothing waits for
+    ever for a machine that cannot do its part.
+    """
+    if not _is_of_the_machine(error):
+        return error
+    if any(job.store.notes(run.artifact) < TRIES - 1 for run in runs):
+        for run in runs:
+            job.store.note(run.artifact, error)
         raise error
+    return error if isinstance(error, MachineError) else MachineError(f"{type(error).__name__}: {error}")
+
+
+def _is_of_the_machine(error: Exception) -> bool:
     causes = [error, *_causes(error)]
-    if any(isinstance(one, ConnectionError | TimeoutError | httpx.HTTPError) for one in causes):
-        raise error
-    if any(isinstance(one, OSError) and one.errno in ERRNOS for one in causes):
-        raise error
-    if any(isinstance(one, RuntimeError) and any(words in str(one) for words in OF_THE_MACHINE) for one in causes):
-        raise error
+    return (
+        isinstance(error, TakenError | MachineError | MemoryError)
+        or any(isinstance(one, ConnectionError | TimeoutError | httpx.HTTPError) for one in causes)
+        or any(isinstance(one, OSError) and one.errno in ERRNOS for one in causes)
+        or any(isinstance(one, RuntimeError) and any(words in str(one) for words in OF_THE_MACHINE) for one in causes)
+    )
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
@@ -143,8 +160,7 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     ready = []
     for run, agent in [(run, caught(_agent, job, run)) for run in runs]:
         if isinstance(agent, Exception):
-            _let_through(agent)
-            yield _write_failed(job, run, agent)
+            yield _write_failed(job, run, _let_through(job, [run], agent))
         else:
             ready.append((run, agent))
     if not ready:
@@ -156,10 +172,11 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
     film = FirstEpisode(next(iter(filmed), None))
     with timed(job.times, EVALUATION, arm.id, len(runs)):
         starts = range(first, first + count)
-        for number, rollout in roll_out(agents, arm.env, starts, on_step=film.add, filmed=filmed):
+        for number, rollout in roll_out(
+            agents, arm.env, starts, on_step=film.add, filmed=filmed, n_workers=job.simulators
+        ):
             if rollout.error is not None:
-                _let_through(rollout.error)
-                yield _write_failed(job, runs[number], rollout.error)
+                yield _write_failed(job, runs[number], _let_through(job, [runs[number]], rollout.error))
             else:
                 yield _write_finished(job, runs[number], rollout, partial(film.write, number))
 

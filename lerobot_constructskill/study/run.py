@@ -13,7 +13,7 @@ from typing import Any
 
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.locks import locked
-from lerobot_constructskill.artifacts.pools import open_pool
+from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError, plural
@@ -95,10 +95,11 @@ def choose(runs: Sequence[Run], only: str) -> list[Run]:
 
 
 def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
+    simulators = max(1, cores() // options.workers) if options.executor == "ray" else None  # jobs share the cores
     different = {run.artifact.digest: run for run in missing}.values()  # two names may be of one thing
     for _, seeds in groupby(different, key=lambda run: (run.arm.setting, run.arm.name)):
         for some in batched(seeds, options.together):  # noqa: B911  the last one may be shorter
-            yield Job(some, store, root, options.workers)
+            yield Job(some, store, root, options.workers, simulators)
 
 
 def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:

@@ -37,6 +37,9 @@ from lerobot_constructskill.training.trainers import versions_of
 OURS = "constructskill"
 """The one environment that a study evaluates in."""
 
+MAKES_RUNS, MEASURES_ERRORS = "lerobot_constructskill.study.execute", "lerobot_constructskill.rollout.heldout"
+"""Modules whose rooms show in a run's episodes, and in held-out errors."""
+
 SEEDS_APART = 2_000
 """From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
 
@@ -162,12 +165,14 @@ class Run:
         """What the packages are that may show in its episodes."""
         policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
         task = get_task(self.arm.env["task"])
-        own = versions_of(policy) if policy else code_of(reference.agent.__module__)
-        return versions(*ACTING) | code_of(task.scene, task.expert) | own
+        seen = [task.expert] if reference and reference.is_expert else []
+        own = versions_of(policy) if policy else code_of(reference.agent.__module__, *seen)
+        return versions(*ACTING) | code_of(task.scene, MAKES_RUNS) | own
 
     def heldout(self, demonstrations: Demonstrations) -> Artifact:
         """Its translation error on what is held out of some demonstrations."""
         on = {"demonstrations": demonstrations.artifact.spec, "holdout": self.arm.training.holdout}
+        on |= {"versions": code_of(MEASURES_ERRORS)}
         return Artifact("heldout", {"checkpoint": self.checkpoint.spec, **on})
 
 

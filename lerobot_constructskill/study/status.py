@@ -2,14 +2,19 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
+from typing import Any
 
+from lerobot_constructskill.artifacts.revisions import BEFORE, EDITED
 from lerobot_constructskill.artifacts.store import LOG
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import EVALUATION, ROUNDS, TRAINING, seconds_per_run
+
+SHOWN = 3
+"""Changes that are named; more are counted."""
 
 
 def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> str:
@@ -47,8 +52,28 @@ def _changed(table: Table, run: Run) -> str | None:
     row = table.outdated(run)
     if row is None:
         return None
-    before = json.loads(row.versions) if row.versions else run.versions
-    return ", ".join(name for name, now in run.versions.items() if before.get(name) != now) or "specification"
+    before = table.store.spec("runs", row.run) if row.run else None
+    if before is None:  # a published folder has the rows alone
+        told = json.loads(row.versions) if row.versions else run.versions
+        if BEFORE in told.values():
+            return f"code, {BEFORE}"
+        before = {"versions": told}
+    now = run.artifact.spec if before.keys() > {"versions"} else {"versions": run.versions}
+    changed = list(dict.fromkeys(_differences(before, now)))
+    more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
+    return ", ".join(changed[:SHOWN]) + more if changed else "specification"
+
+
+def _differences(before: Any, now: Any, name: str = "") -> Iterator[str]:
+    """What differs between two specifications: packages and rooms by their names, settings by their places."""
+    if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
+        if before != now:
+            edited = now.partition(EDITED)[2] if isinstance(now, str) else ""
+            yield f"{name} ({edited})" if edited else name
+        return
+    for key in dict.fromkeys([*now, *before]):
+        inner = key if name.endswith("versions") else f"{name}.{key}".lstrip(".")
+        yield from _differences(before.get(key), now.get(key), inner)
 
 
 def _failures(table: Table, runs: Sequence[Run]) -> list[str]:

@@ -20,7 +20,7 @@ from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
 
-LEARNING = ("lerobot_env_constructskill", "lerobot", "torch", "numpy")
+LEARNING = ("lerobot", "torch", "numpy")
 """Packages whose versions may show in any checkpoint."""
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
@@ -56,8 +56,9 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
     Raises:
         InputError: it reads the state, and observations have pictures alone, or a camera that they do not have.
     """
-    # LeRobot gives a policy that does not name its inputs all of the data set, the state among them.
-    reads_state = OBS_STATE in policy.input_features if policy.input_features else getattr(policy, "use_state", True)
+    # LeRobot gives a policy that does not name its inputs all of the data set; its own types read the state in it.
+    unsaid = getattr(policy, "use_state", type(policy).__module__.startswith("lerobot."))
+    reads_state = OBS_STATE in policy.input_features if policy.input_features else unsaid
     if reads_state and obs_type == "pixels":
         raise InputError("The policy reads observation.state; where it acts, obs_type has to be 'pixels_agent_pos'.")
     camera, shown = getattr(policy, "camera", None), OBS_TYPES[obs_type]  # others look at whatever they are shown

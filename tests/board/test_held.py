@@ -11,7 +11,6 @@ import hashlib
 import json
 import sys
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -19,6 +18,7 @@ import numpy as np
 import pytest
 
 from lerobot_constructskill.artifacts.processor import make, processor
+from lerobot_constructskill.artifacts.revisions import revisions
 from lerobot_constructskill.board.submission import read_submission, width
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
@@ -100,13 +100,11 @@ def record_anew() -> None:
     with TemporaryDirectory() as scratch:
         filmed = {"videos": videos(Path(scratch, "set"))}
     pictures = {task: frames for task, (_, frames, _) in executed.items()} | filmed
-    ours = version("lerobot_env_constructskill")
-    if recorded["pictures"].get(make(), pictures) != pictures and recorded["version"] == ours:
-        sys.exit(
-            f"Pictures changed since {ours}: raise the version in pyproject.toml, by which stores tell them apart."
-        )
+    ours = revisions("lerobot_constructskill.envs")
+    if recorded["pictures"].get(make(), pictures) != pictures and recorded["revisions"] == ours:
+        sys.exit("Pictures changed: raise the revision of sim or envs, by which stores tell them apart.")
     recorded["states"][make()] = {task: states for task, (states, _, _) in executed.items()}
-    recorded["pictures"][make()], recorded["version"] = pictures, ours
+    recorded["pictures"][make()], recorded["revisions"] = pictures, ours
     RECORDED.write_text(json.dumps(recorded, indent=1) + "\n")
 
 

@@ -208,6 +208,19 @@ def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint
     evaluate_offline(replace(asked, episodes=EPISODES))
 
 
+def of_tasks(*tasks_and_numbers) -> SimpleNamespace:
+    """The metadata of a set with so many episodes of each task, one after another."""
+    pairs = zip(tasks_and_numbers[::2], tasks_and_numbers[1::2], strict=True)
+    return SimpleNamespace(episodes=[{"tasks": [task]} for task, number in pairs for _ in range(number)])
+
+
+def test_lerobot_holds_out_of_each_task(tmp_path):
+    """As its `make_train_eval_datasets`: the last of two tasks of eight."""
+    (tmp_path / TRAIN_CONFIG).write_text(json.dumps({"dataset": {"repo_id": "a/b", "eval_split": 0.125}}))
+    asked = SimpleNamespace(repo_id="a/b", num_episodes=16, root=tmp_path, meta=of_tasks("lift", 8, "turn", 8))
+    assert hub.trained_on(tmp_path, asked) == set(range(16)) - {7, 15}
+
+
 def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_path):
     (tmp_path / "features" / "meta").mkdir(parents=True)
     (tmp_path / "copy" / "data").mkdir(parents=True)
@@ -230,7 +243,7 @@ def test_what_a_checkpoint_was_trained_on_the_features_of_is_not_held_out(tmp_pa
         ("alice/other", "copy", {0, 2}),
         ("alice/other", "nothing", set()),
     ):
-        asked = SimpleNamespace(repo_id=repo_id, num_episodes=4, root=tmp_path / root)
+        asked = SimpleNamespace(repo_id=repo_id, num_episodes=4, root=tmp_path / root, meta=of_tasks("a", 4))
         assert hub.trained_on(tmp_path, asked) == episodes
         assert not hub.trained_on(tmp_path / "nothing", asked)
 
@@ -241,7 +254,7 @@ def test_of_a_checkpoint_that_says_nothing_of_its_training_set_a_line_is_said(tm
     column = {"dtype": "float32", "shape": [1], "info": {"source_repo_id": "alice/set", "source_sha256": "0"}}
     (home / "alice" / "encoded" / "meta" / "info.json").write_text(json.dumps({"features": {"a": column}}))
     monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", home)
-    asked = SimpleNamespace(repo_id="alice/set", num_episodes=16, root=tmp_path / "nothing")
+    asked = SimpleNamespace(repo_id="alice/set", num_episodes=16, root=tmp_path / "nothing", meta=of_tasks("a", 16))
     for number, (file, told, seen) in enumerate(
         (
             (TRAIN_CONFIG, {"dataset": {"repo_id": "alice/encoded", "root": None}}, set(range(16))),

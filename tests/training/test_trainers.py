@@ -11,8 +11,8 @@ from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_constructskill.artifacts import disk
 from lerobot_constructskill.artifacts.store import Artifact, Store
-from lerobot_constructskill.errors import MachineError
-from lerobot_constructskill.training.checkpoints import writing_checkpoint
+from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.training.checkpoints import check_inputs, writing_checkpoint
 from lerobot_constructskill.training.lerobot_train import LOG, _call
 
 
@@ -107,3 +107,9 @@ def test_when_work_begins_no_thread_computes_with_denormal_numbers(command, modu
     script = ALL_THREADS_FLUSH.format(command=command, module=module, first=first)
     run = [sys.executable, "-c", script, *flags, "--store=store"]
     subprocess.run(run, check=True, cwd=tmp_path, env=os.environ | {"OMP_NUM_THREADS": "2"})
+
+
+def test_a_policy_of_others_that_names_no_inputs_is_not_taken_to_read_the_state():
+    check_inputs(SimpleNamespace(input_features=None), "pixels")
+    with pytest.raises(InputError, match="reads observation.state"):
+        check_inputs(ACTConfig(), "pixels")
