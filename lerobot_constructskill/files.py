@@ -140,9 +140,7 @@ def _json(text: str) -> Any:
         return made
 
     value = json.loads(text, object_pairs_hook=mapping, parse_int=lambda digits: _bounded(int(digits[:MOST_BITS])))
-    if "\\u" in text:
-        json.dumps(value, ensure_ascii=False).encode()
-    return value
+    return _whole(value) if "\\u" in text else value
 
 
 def _bounded(number: int) -> int:
@@ -158,6 +156,9 @@ class Loader(yaml.SafeLoader):
     yes, no, on and off.
     """
 
+    own_tags: frozenset[str] = frozenset()
+    """Tags that are read; YAML's own, `!!int '010'`, would say what the text does not."""
+
     yaml_implicit_resolvers = deepcopy(yaml.SafeLoader.yaml_implicit_resolvers)
 
     def get_single_node(self) -> yaml.Node | None:
@@ -166,10 +167,16 @@ class Loader(yaml.SafeLoader):
             raise InputError(f"it stands for more than {MOST_VALUES:,} values: its aliases multiply")
         return node
 
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        tag = getattr(self.peek_event(), "tag", None)
+        if tag is not None and tag not in self.own_tags:
+            raise InputError(f"the tag {tag} is not read")
+        return super().compose_node(parent, index)
+
     def compose_mapping_node(self, anchor: str | None) -> yaml.MappingNode:
         node, known = super().compose_mapping_node(anchor), set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode) and key.tag != MERGE):
-            value = self.construct_object(key)
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            value = key.value if key.tag == MERGE else str(self.construct_object(key))
             if value in known:
                 raise InputError(f"line {key.start_mark.line + 1}: {value!a} stands there a second time, keep one")
             known.add(value)
@@ -216,12 +223,18 @@ class Yaml[Kind](Json[Kind]):
         return self.parse(read_text(path, MOST_YAML), f"'{path}'")
 
     def parse(self, text: str, where: str) -> Kind:
-        return _plain(lambda: self._checked(yaml.load(text, self.loader)), f"{where} is not {self.what}")
+        return _plain(lambda: self._checked(_whole(yaml.load(text, self.loader))), f"{where} is not {self.what}")
 
 
 def parse_yaml(text: str, where: str, loader: type[Loader] = Loader) -> Any:
     """The value of a text that stands at `where`. Raises InputError where it is no YAML."""
-    return _plain(lambda: yaml.load(text, loader), f"{where} cannot be read")
+    return _plain(lambda: _whole(yaml.load(text, loader)), f"{where} cannot be read")
+
+
+def _whole(value: Any) -> Any:
+    """A value that can be written."""
+    json.dumps(value, ensure_ascii=False, default=str).encode()
+    return value
 
 
 def _plain[Value](parse: Callable[[], Value], failing: str) -> Value:
@@ -272,7 +285,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, most: int | N
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read: {first_line(error)[:200]}.") from None
+        raise InputError(f"'{path}' cannot be read: {first_line(error)[:200].rstrip('.')}.") from None
     return table
 
 

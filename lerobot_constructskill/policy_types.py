@@ -13,7 +13,7 @@ from lerobot.utils import auto_select_torch_device
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import load_plugins
-from lerobot_constructskill.parsing import as_input, decode
+from lerobot_constructskill.parsing import as_input, check_kinds, decode
 
 CONFIGURATION = Json("a policy's configuration")
 
@@ -43,7 +43,8 @@ def read_policy(checkpoint: Path | str, **overrides: Any) -> PreTrainedConfig:
     load_plugins()
     flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
     if (file := Path(checkpoint) / "config.json").exists():
-        CONFIGURATION.read(file)
+        saved = CONFIGURATION.read(file)
+        check_kinds(PreTrainedConfig, saved, f"'{file}': ")
     with as_input():
         try:
             return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)

@@ -18,6 +18,8 @@ from lerobot_constructskill.presets import named
 class Loader(files.Loader):
     """`files.Loader` with `!policy`, which takes names of shipped policies and opens no other file."""
 
+    own_tags = frozenset({"!policy"})
+
 
 def _policy(loader: Loader, node: yaml.Node) -> dict[str, Any]:
     if isinstance(node, yaml.ScalarNode):

@@ -146,3 +146,55 @@ def test_no_name_leads_out_of_the_data_folder(command: str, name: str) -> None:
 def test_a_film_has_the_ending_that_it_can_be_written_by(out):
     with pytest.raises(InputError, match=r"ends in \.mp4"):
         FilmConfig(out=Path(out))
+
+
+@pytest.mark.parametrize(
+    ("command", "flag", "field", "value"),
+    [
+        ("constructskill-push", "--tag=1.10", "tag", "1.10"),
+        ("constructskill-push", "--tag=null", "tag", None),
+        ("constructskill-verify", "--value=0x10", "value", "0x10"),
+        ("constructskill-verify", "--value=a # b", "value", "a # b"),
+        ("constructskill-report", "--root=2026", "root", Path("2026")),
+        ("constructskill-generate", "--noise.sigma=1e-4", "noise", None),
+    ],
+)
+def test_text_is_what_was_written(command, flag, field, value) -> None:
+    config_class = config_classes()[command]
+    given = [flag for flag in flags(command, config_class) if not flag.startswith(f"--{field}=")]
+    made = parsing.parse(config_class, [*given, flag])
+    assert field == "noise" or getattr(made, field) == value
+
+
+GENERATE = "repo_id: a/b\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("episodes: true", "episodes must be a whole number, not True"),
+        ("episodes: '3'", "episodes must be a whole number, not '3'"),
+        ("episodes: 010", "episodes must be a whole number, not '010'"),
+        ("root: 1.10", r"root must be text.*, not 1.1 \(put it in quotation marks\)"),
+        ("root: [a]", "root must be text"),
+        ("noise: []", "noise must be a mapping, not "),
+        ("noise: null", "noise must be a mapping, not None"),
+        ("noise: {sigma: true}", "noise.sigma must be .*a number, not True"),
+        ("expert: 3", "expert must be a mapping, not 3"),
+    ],
+)
+def test_nothing_is_taken_for_something_else(text, said, tmp_path) -> None:
+    (tmp_path / "mine.yaml").write_text(GENERATE + text)
+    with pytest.raises(InputError, match=said):
+        parsing.parse(config_classes()["constructskill-generate"], [f"--config_path={tmp_path / 'mine.yaml'}"])
+
+
+def test_a_policys_own_fields_are_looked_at_too() -> None:
+    import lerobot.policies  # noqa: F401  registers the policies
+
+    from lerobot_constructskill.policy_types import decode_policy
+
+    with pytest.raises(InputError, match="optimizer_lr must be a number, not True"):
+        decode_policy({"type": "act", "optimizer_lr": True})
+    assert decode_policy({"type": "act", "replace_final_stride_with_dilation": True})
+    assert decode_policy({"type": "frozen_vit", "optimizer_lr": "1e-3"}).optimizer_lr == 1e-3

@@ -190,12 +190,29 @@ def test_nothing_is_converted_and_nothing_dropped():
         ("1.5e+3", 1500.0),
         ("1e-4", "1e-4"),
         (".inf", float("inf")),
+        ("'010'", "010"),
         ("~", None),
     ],
 )
 def test_yaml_is_what_it_looks_like(text, value):
     assert parse_yaml(text, "It") == value and type(parse_yaml(text, "It")) is type(value)
     assert not isinstance(value, date)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a: !!int '010'", "the tag tag:yaml.org,2002:int is not read"),
+        ("a: !!bool yes", "is not read"),
+        ("a: &x {b: 1}\nc:\n  <<: *x\n  <<: *x", "line 4: '<<' stands there a second time"),
+        ("{1: a, '1': b}", "'1' stands there a second time"),
+        (r'a: "\ud800"', "half of a character"),
+        ("a: 1\n---\nb: 2", "expected a single document|but found another document"),
+    ],
+)
+def test_yaml_does_not_say_two_things(text, said):
+    with pytest.raises(InputError, match=said):
+        parse_yaml(text, "It")
 
 
 @pytest.mark.parametrize("table", [one for one in KINDS.values() if isinstance(one, Table)], ids=lambda one: one.what)

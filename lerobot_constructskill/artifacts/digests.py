@@ -32,12 +32,12 @@ def files_below(root: Path, *folders: str) -> Iterator[Path]:
     A folder may be a link, to a larger disk for instance: `Path.rglob` would leave out what lies there.
     """
     for folder in folders:
-        yield from sorted(
-            path
-            for parent, _, names in os.walk(root / folder, followlinks=True)
-            for path in (Path(parent, name) for name in names)
-            if path.is_file()
-        )
+        found, walked = [], set()
+        for parent, below, names in os.walk(root / folder, followlinks=True):
+            walked.add(os.path.realpath(parent))
+            below[:] = [name for name in below if os.path.realpath(Path(parent, name)) not in walked]  # no circles
+            found += [path for path in (Path(parent, name) for name in names) if path.is_file()]
+        yield from sorted(found)
 
 
 def data_sha256(root: Path) -> str:

@@ -10,7 +10,7 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -90,6 +90,18 @@ class Store:
     def keeps(self, kind: str, name: str) -> bool:
         """Whether something of this digest has been made, whatever its specification."""
         return (self.root / kind / name).is_dir()
+
+    def obtain(self, artifact: Artifact, make: Callable[[Path], None], keep: str | None = None) -> Path:
+        """The folder of an artefact, which `make` writes to the path that it is given, where it is not there.
+
+        Args:
+            keep: as of `staged`.
+        """
+        with self.claim([artifact]) as missing:
+            for one in missing:
+                with self.writing(one, keep) as folder:
+                    make(folder)
+        return self.folder(artifact)
 
     @contextmanager
     def claim(self, artifacts: Sequence[Artifact]) -> Iterator[list[Artifact]]:

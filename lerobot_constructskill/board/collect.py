@@ -11,7 +11,7 @@ from lerobot_constructskill.envs.recording import RECORDINGS, Recording, read_re
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_environments, read_rows
 
-SEED = r"seed_(\d{1,9})"
+SEED = r"seed_([0-9]{1,9})"
 
 type Piles = dict[int, list[Recording]]
 """Training seed to what its policy did."""

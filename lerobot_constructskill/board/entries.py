@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import date
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
@@ -30,7 +31,7 @@ class Verdict(TypedDict):
 
     submission: str
     level: Literal[LEVELS]
-    date: str
+    date: date
     versions: dict[str, str]
     machines: NotRequired[list[str]]  # before 2026-11-24 none was named
     rerun: NotRequired[dict[str, Any]]
@@ -121,6 +122,8 @@ def read_entries(root: Path) -> Read:
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
     # What ends in .partial is being written, or was when its process was killed.
+    if (root / VERIFIED).exists() and not (root / VERIFIED).is_dir():
+        raise InputError(f"'{root / VERIFIED}' is not a folder of verdicts.")
     read = Read([], [])
     for path in sorted((root / ENTRIES).iterdir()):
         if path.suffix != ".partial":

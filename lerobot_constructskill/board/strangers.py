@@ -7,7 +7,7 @@ from pathlib import Path
 import yaml
 
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.files import Loader, read_bytes
+from lerobot_constructskill.files import MERGE, Loader, read_bytes
 
 
 def read_files(root: Path, most: Mapping[str, int]) -> dict[str, bytes]:
@@ -28,10 +28,13 @@ def read_files(root: Path, most: Mapping[str, int]) -> dict[str, bytes]:
 
 
 class Plain(Loader):
-    """`files.Loader` without tags, anchors and aliases."""
+    """`files.Loader` without tags, anchors, aliases and merged mappings."""
 
     def compose_node(self, parent, index):
         event = self.peek_event()
         if isinstance(event, yaml.AliasEvent) or event.anchor is not None or getattr(event, "tag", None) is not None:
             raise InputError("tags, anchors and aliases are not read")
-        return super().compose_node(parent, index)
+        node = super().compose_node(parent, index)
+        if node.tag == MERGE:
+            raise InputError("mappings are not merged")
+        return node

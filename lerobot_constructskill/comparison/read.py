@@ -55,6 +55,8 @@ def _env(root: Path, setting: str) -> dict:
 def _outcomes(rows: pd.DataFrame) -> Outcomes | None:
     if rows["error_kind"].notna().any():
         return None
+    if rows["placed"].isna().any() or rows["evaluation_seed"].duplicated().any():
+        raise InputError(f"The rows of {rows['variant'].iloc[0]} lack a placement, or have two of one start.")
     return {int(start): bool(placed) for start, placed in zip(rows["evaluation_seed"], rows["placed"], strict=True)}
 
 
@@ -124,15 +126,16 @@ def read_evaluated(name: str, folders: Sequence[Path], first_start: int | None, 
 
 
 def _successes(file: Path, task: str | None, label: str) -> list[bool]:
-    results = {
-        (one["task_group"], one["task_id"]): one["metrics"]["successes"] for one in EVALUATED.read(file)["per_task"]
-    }
+    told = EVALUATED.read(file)["per_task"]
+    results = {(one["task_group"], one["task_id"]): one["metrics"]["successes"] for one in told}
+    if len(results) < len(told):
+        raise InputError(f"'{file}' has two results of one task.")
     suites = {f"{suite}{label}": tasks for suite, tasks in SUITES.items()}
     ours = {key: own for key, own in results.items() if key[0] in suites or key[0] == f"{LOOSE}{label}"}
     if len(ours) == 1 and next(iter(ours))[0] == f"{LOOSE}{label}":
         return next(iter(ours.values()))
     for (suite, number), own in ours.items():
-        if suites.get(suite, ())[number : number + 1] == (task,):
+        if suites.get(suite, ())[number : number + 1] == (task,) and number >= 0:
             return own
     found = ", ".join(f"{suite} {number}" for suite, number in results)
     raise InputError(f"{file} has no result that is of {task or 'one task'}{label} for certain; it has: {found}.")

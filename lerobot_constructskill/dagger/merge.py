@@ -34,17 +34,13 @@ def obtain_data(plan: Plan, number: int, store: Store) -> LeRobotDataset:
         return parts[0]
     made = plan.data(number)
     repo_id = f"local/{made.digest}"
-    with store.claim([made]) as missing:
-        if missing:
-            with store.writing(made) as folder, quiet():
-                _merge(plan, parts, repo_id, folder, store)
-    return LeRobotDataset(repo_id, root=store.folder(made))
+    return LeRobotDataset(repo_id, root=store.obtain(made, lambda folder: _merge(plan, parts, repo_id, folder, store)))
 
 
 def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, store: Store) -> None:
     base, *rounds = parts
     # The disk's room is measured before the scratch folder is gone.
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):
+    with quiet(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):
         first = Path(scratch) / "demonstrations"
         _add_columns(plan, base, first)
         aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))

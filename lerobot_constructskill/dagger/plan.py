@@ -95,7 +95,7 @@ class Plan:
         return data, [*policies, self._trained_on(data[-1])], rounds
 
     def _trained_on(self, data: Artifact) -> Artifact:
-        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, data.spec)
+        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, data.spec, stack=1)
 
     def _driven_by(self, policy: Artifact, number: int) -> Artifact:
         facts = {

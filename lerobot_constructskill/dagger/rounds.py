@@ -62,26 +62,21 @@ def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset,
     """
     made = plan.round(number)
     repo_id = f"local/{made.digest}"
-    with store.claim([made]) as missing:
-        if missing:
-            with store.writing(made, keep=SHARDS) as folder:
-                _write_round(plan, number, repo_id, folder, store)
-    folder = store.folder(made)
+    folder = store.obtain(made, lambda folder: _write_round(plan, number, repo_id, folder, store), keep=SHARDS)
     return LeRobotDataset(repo_id, root=folder), DRIVEN.read(folder / OUTCOMES)
 
 
 def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpisode]:
     """How policy `number` does in every evaluation episode by itself."""
-    made = plan.evaluation(number)
-    with store.claim([made]) as missing:
-        if missing:
-            never = plan.env["episode_length"] + 1  # nobody gives up for it
-            alone = Drive(number, beta=0.0, patience=never, pictures=False)
-            outcomes = [DrivenEpisode.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
-            with store.writing(made) as folder:
-                folder.mkdir()
-                _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
-    return DRIVEN.read(store.folder(made) / OUTCOMES)
+
+    def make(folder: Path) -> None:
+        never = plan.env["episode_length"] + 1  # nobody gives up for it
+        alone = Drive(number, beta=0.0, patience=never, pictures=False)
+        outcomes = [DrivenEpisode.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
+        folder.mkdir()
+        _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
+
+    return DRIVEN.read(store.obtain(plan.evaluation(number), make) / OUTCOMES)
 
 
 def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Store) -> None:

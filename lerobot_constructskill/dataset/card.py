@@ -69,6 +69,8 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     check_values(Provenance, data.facts, f"{SIDECAR}: ")
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
+    if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:
+        raise InputError(f"phase has the value {min(unknown)[:40]!a}, which is no phase of an expert.")
     lengths = [span.stop - span.start for span in data.spans()]
     experts = data.rounds == 0
     phases, noise = data.column("phase")[experts], data.column("dart.noise")[experts]

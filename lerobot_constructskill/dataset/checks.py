@@ -3,6 +3,7 @@
 `CHECKS` names them. Noise is not judged by its spread alone: it is a function of the seed, so it is drawn again.
 """
 
+import operator
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -249,9 +250,10 @@ def check_provenance(data: DataSet) -> Iterator[str]:
     discarded = data.facts["discarded_seeds"]
     starts = [span.start for span in data.spans()]
     seeds = data.column("sim.seed")[[start for start in starts if data.rounds[start] == 0]].tolist()
-    wanted = list(range(data.config.seed_start, data.config.seed_start + data.facts["attempts"]))
+    wanted = range(data.config.seed_start, data.config.seed_start + data.facts["attempts"])
     yield from check_rounds(data)
-    if sorted([*seeds, *discarded]) != wanted:
+    found = sorted([*seeds, *discarded])
+    if len(found) != len(wanted) or any(map(operator.ne, found, wanted)):
         yield "The seeds of the episodes and the discarded ones are not those of the attempts, one by one."
     if seeds != sorted(seeds):
         yield "The episodes are not in the order of their seeds."

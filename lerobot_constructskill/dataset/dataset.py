@@ -1,5 +1,6 @@
 """A finished data set as plain tables, read from its files alone: whoever checks LeRobot's work cannot ask LeRobot."""
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +30,13 @@ STATISTICS = Json("statistics of columns", dict[str, dict[str, Any]])
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
 VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
 """What LeRobot's episode tables say of every episode, and of its part of every video."""
+
+
+PLACE = re.compile(r"(?!/)([\w./-]|\{(video_key|chunk_index(:0?\dd)?|file_index(:0?\dd)?)\})+")
+"""Where a data set's videos may lie, as LeRobot's `video_path` says it."""
+
+NUMBERS = {"float32": "f", "float64": "f", "int64": "i", "int32": "i", "bool": "b"}
+"""A column's `dtype` to the kind that NumPy has for it; a whole number that is missing makes all of them floats."""
 
 
 class Facts(dict):
@@ -84,7 +92,11 @@ class DataSet:
         wrong = {np.shape(value) or (1,) for value in values} - {wanted}
         if wrong:
             raise InputError(f"{name} has values of shape {wrong.pop()}, not {wanted} as info.json says.")
-        return np.stack(values) if len(np.shape(values.iloc[0])) else values.to_numpy()
+        column = np.stack(values) if len(np.shape(values.iloc[0])) else values.to_numpy()
+        kind = self.info["features"][name]["dtype"]
+        if kind in NUMBERS and column.dtype.kind not in NUMBERS[kind]:
+            raise InputError(f"{name} has values that are no {kind}, as info.json says, or lacks some.")
+        return column
 
     @cached_property
     def config(self) -> GenerateConfig:
@@ -115,6 +127,8 @@ class DataSet:
         return [name for name, feature in self.info["features"].items() if feature["dtype"] == "video"]
 
     def video(self, camera: str, episode: pd.Series) -> Path:
+        if not self.info.get("video_path"):
+            raise InputError(f"{INFO} does not say where its videos are, video_path.")
         indices = {name: int(episode[f"videos/{camera}/{name}"]) for name in ("chunk_index", "file_index")}
         return self.root / self.info["video_path"].format(video_key=camera, **indices)
 
@@ -151,17 +165,24 @@ def open_dataset(root: Path) -> DataSet:
     missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
     if missing:
         raise InputError(f"meta/episodes/ has no column {missing[0]}.")
+    for name in (*EPISODE_COLUMNS, *of_videos):
+        if data.episodes[name].dtype.kind not in "if" or not np.isfinite(data.episodes[name]).all():
+            raise InputError(f"{name} in meta/episodes/ must be a number in every row.")
     return data
 
 
 def check_is_there(root: Path) -> None:
-    """Refuse a folder without a data set.
+    """Refuse a folder without a data set, or whose videos would lie elsewhere.
 
     Raises:
-        FileNotFoundError: meta/info.json, which every data set has, is missing.
+        MissingError: meta/info.json, which every data set has, is missing.
+        InputError: it is not LeRobot's description of one.
     """
     if not (root / INFO).is_file():
         raise MissingError(f"There is no data set in {root}: {INFO} is missing.")
+    template = DATA_SET.read(root / INFO).get("video_path")
+    if template is not None and not (PLACE.fullmatch(template) and ".." not in template):
+        raise InputError(f"video_path in '{root / INFO}' is no place in the data set: {template[:100]!a}.")
 
 
 def read_provenance(root: Path) -> Facts:

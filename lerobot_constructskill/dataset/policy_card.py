@@ -18,13 +18,16 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     outcomes = []
     for path in folder.glob("seed_*/eval_info.json"):
         name = path.parent.name.removeprefix("seed_")
-        if not name.isdecimal():
+        if not (name.isascii() and name.isdecimal()):
             raise InputError(f"'{path.parent}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
         stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
         outcomes.append((int(name), lifted, placed, len(stages)))
     if not outcomes:
         raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
+    seeds = [seed for seed, *_ in outcomes]
+    if twice := [seed for seed in seeds if seeds.count(seed) > 1]:
+        raise InputError(f"'{folder}' has two folders of training seed {twice[0]}.")
     return sorted(outcomes)
 
 

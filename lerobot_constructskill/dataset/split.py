@@ -11,6 +11,9 @@ from lerobot_constructskill.dataset.dataset import check_is_there
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
 
+SCHEMA = pa.schema([("episode_index", pa.int64()), ("length", pa.int64()), ("tasks", pa.list_(pa.string()))])
+"""What is read of LeRobot's table of episodes."""
+
 
 @dataclass(frozen=True)
 class Split:
@@ -38,7 +41,10 @@ def split_of(root: Path) -> Split:
     """
     check_is_there(root)
     files = sorted(root.glob("meta/episodes/*/*.parquet"))
-    tables = [read_parquet(file, ["episode_index", "length", "tasks"]) for file in files]
+    tables = [read_parquet(file, SCHEMA.names) for file in files]
+    for file, table in zip(files, tables, strict=True):
+        if not table.schema.equals(SCHEMA) or any(column.null_count for column in table.columns):
+            raise InputError(f"'{file}' must have an index, a length and tasks in every row.")
     rows = pa.concat_tables(tables).sort_by("episode_index").to_pylist() if tables else []
     if not rows:
         raise InputError(f"The data set in {root} has no episodes.")

@@ -1,6 +1,7 @@
 """Demonstrations from a store, where they are made if they are not there."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_constructskill.artifacts.store import Artifact, Store
@@ -28,9 +29,9 @@ def obtain_demonstrations(config: GenerateConfig, store: Store) -> "LeRobotDatas
 
     made = artifact(config)
     repo_id = f"local/{made.digest}"
-    with store.claim([made]) as missing:
-        if missing:
-            check_disk(config, store.folder(made))
-            with store.writing(made, keep=SHARDS) as folder:
-                write(replace(config, repo_id=repo_id), folder)
-    return LeRobotDataset(repo_id, root=store.folder(made))
+
+    def make(folder: Path) -> None:
+        check_disk(config, store.folder(made))
+        write(replace(config, repo_id=repo_id), folder)
+
+    return LeRobotDataset(repo_id, root=store.obtain(made, make, keep=SHARDS))

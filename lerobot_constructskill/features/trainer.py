@@ -5,6 +5,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,9 @@ from lerobot_constructskill.policies.frozen_vit.weights import find_sha256, load
 from lerobot_constructskill.policy_types import read_policy
 from lerobot_constructskill.progress import Progress, quiet
 
+STACK = 10
+"""Seeds whose heads are trained as one computation: a step of all of them takes little longer than one of a seed."""
+
 
 class FeatureTrainer:
     """`training.trainers.Trainer` of frozen_vit."""
@@ -51,6 +55,10 @@ class FeatureTrainer:
 
     def seeds_together(self, config: FrozenViTChunkConfig) -> bool:
         return True
+
+    def stack(self, config: FrozenViTChunkConfig) -> int:
+        """Seeds whose readout learns are trained each by itself."""
+        return 1 if READOUTS[config.readout].learns else STACK
 
     def settle(self, config: FrozenViTChunkConfig) -> FrozenViTChunkConfig:
         """Write out what `auto` means here, and which weights there are; None where there are none.
@@ -85,12 +93,9 @@ class FeatureTrainer:
             yield
             return
         made = features_artifact(config, whole)
-        with store.claim([made]) as missing:
-            if missing:
-                info = of_parts[0].meta.features[feature_key(config.camera)]["info"]
-                joined = of_parts, info, f"local/{made.digest}"
-                with store.writing(made) as folder:
-                    join_feature_sets(whole, config.camera, *joined, folder, **_beside(config))
+        info = of_parts[0].meta.features[feature_key(config.camera)]["info"]
+        joined = whole, config.camera, of_parts, info, f"local/{made.digest}"
+        store.obtain(made, lambda folder: join_feature_sets(*joined, folder, **_beside(config)))
         try:
             yield
         finally:
@@ -103,7 +108,7 @@ class FeatureTrainer:
         self,
         config: FrozenViTChunkConfig,
         demonstrations: LeRobotDataset,
-        writers: Mapping[int, Callable[..., AbstractContextManager[Path]]],
+        writers: Mapping[int, Callable[..., AbstractContextManager[Path]] | None],
         epochs: int,
         batch_size: int,
         held_out: Sequence[int],
@@ -113,8 +118,9 @@ class FeatureTrainer:
         features = obtain_features(config, demonstrations, store)
         for seeds, policies in _trained(config, features, list(writers), epochs, batch_size, held_out):
             preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=features.meta.stats)
-            errors = heldout_mse(policies, features, held_out, preprocess)
-            for seed, policy, error in zip(seeds, policies, errors, strict=True):
+            asked = {seed: policy for seed, policy in zip(seeds, policies, strict=True) if writers[seed]}
+            errors = heldout_mse([*asked.values()], features, held_out, preprocess)
+            for (seed, policy), error in zip(asked.items(), errors, strict=True):
                 made_of = {config.backbone: _backbone_line(policy.config)}
                 with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
                     save_checkpoint(policy, features, folder)
@@ -157,7 +163,9 @@ def _trained(
     costs memory. Such seeds are trained side by side, a process for each core, or one after another on a GPU.
     """
     if not READOUTS[config.readout].learns:
-        yield seeds, train_seeds(config, features, seeds, *recipe)
+        for _, stacked in groupby(sorted(seeds), key=lambda seed: seed // STACK):
+            stack = list(stacked)
+            yield stack, train_seeds(config, features, stack, *recipe)
     elif min(len(seeds), cores()) == 1 or config.device != "cpu":
         for seed in seeds:
             yield [seed], train_seeds(config, features, [seed], *recipe)
@@ -207,13 +215,13 @@ def obtain_features(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset
     """
     made = features_artifact(config, demonstrations)
     repo_id = f"local/{made.digest}"
-    with store.claim([made]) as missing:
-        if missing:
-            eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
-            encoder, info = load_encoder(config.backbone, config.backbone_path, _precision(config), *eyes)
-            with store.writing(made, keep=PARTS) as folder:
-                write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, **_beside(config))
-    return LeRobotDataset(repo_id, root=store.folder(made))
+
+    def make(folder: Path) -> None:
+        eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
+        encoder, info = load_encoder(config.backbone, config.backbone_path, _precision(config), *eyes)
+        write_feature_set(demonstrations, config.camera, encoder, info, repo_id, folder, **_beside(config))
+
+    return LeRobotDataset(repo_id, root=store.obtain(made, make, keep=PARTS))
 
 
 def features_artifact(config: FrozenViTChunkConfig, demonstrations: LeRobotDataset) -> Artifact:

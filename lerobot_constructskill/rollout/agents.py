@@ -5,7 +5,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_p
 
 from lerobot_constructskill.contract import CAMERAS
 from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.policy_types import read_policy
 
 
@@ -45,6 +46,27 @@ class Agent(Protocol):
         """Return the action of this step, float32 (A,), in metres with the gripper last."""
 
 
+class _Step(TypedDict):
+    registry_name: str
+
+
+class _Pipeline(TypedDict):
+    steps: list[_Step]
+
+
+PIPELINE = Json("a processor whose steps are all registered", _Pipeline)
+"""A step that has a `class` in place of its name in LeRobot's registry may be any function, which would be called."""
+
+
+def _check_files(checkpoint: Path) -> None:
+    """Refuse a folder that would hang, or run what somebody wrote into it; a name on the Hub is LeRobot's to judge."""
+    for path in checkpoint.glob("*"):
+        if path.is_fifo() or path.is_char_device():
+            raise InputError(f"'{path}' is not a regular file.")
+    for path in checkpoint.glob("policy_*processor.json"):
+        PIPELINE.read(path)
+
+
 class PolicyAgent:
     """A LeRobot policy between its two processors, as `lerobot-eval` runs it.
 
@@ -71,6 +93,7 @@ class PolicyAgent:
             ValueError: its configuration cannot be read, or is of an unknown type.
             OSError: there is no such checkpoint.
         """
+        _check_files(Path(checkpoint))
         config = read_policy(checkpoint, **overrides)
         if config.use_peft:
             raise InputError(f"'{checkpoint}' is a PEFT adapter; merge it into its policy first.")

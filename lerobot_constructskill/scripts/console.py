@@ -24,6 +24,9 @@ from lerobot_constructskill.presets import find, names
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 """Exit statuses: something the user can fix; a fault of this package; Ctrl-C."""
 
+LONGEST = 2000
+"""Characters of a sentence; the log has the whole."""
+
 DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
 
@@ -63,7 +66,11 @@ def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
             f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
             "marks, so that the shell leaves it alone."
         )
-    return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *flags[len(values) :]]
+    others = flags[len(values) :]
+    for name, value in zip(first, values, strict=False):
+        if any(flag.split("=")[0] == f"--{name}" for flag in others):
+            raise InputError(f"'{value}' and --{name} are two values of one field; give only one.")
+    return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *others]
 
 
 def _put_file(flags: list[str], kind: str) -> list[str]:
@@ -157,6 +164,7 @@ def _report(error: BaseException, command: list[str], debug: bool) -> int:
 
 def _judge(error: BaseException) -> tuple[int, str]:
     said = " ".join(str(error).split())
+    said = said if len(said) <= LONGEST else f"{said[:LONGEST]}..."
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"
     if isinstance(error, UserError | OSError):

@@ -1,5 +1,6 @@
 """`constructskill-submit`: make a submission for the board from recorded episodes."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -37,7 +38,7 @@ class SubmitConfig:
             raise InputError("Give what the submission is made from: --recorded, or --study with --variant.")
         if self.study_settings and self.study is None:
             raise InputError("study_settings are of --study.")
-        if bad := [seed for seed in self.failures if not (seed.isdecimal() and len(seed) < 10)]:
+        if bad := [seed for seed in self.failures if not re.fullmatch("0|[1-9][0-9]{0,8}", seed)]:
             raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
 
 

@@ -149,7 +149,9 @@ def _fit(job: Job, runs: Sequence[Run]) -> None:
                 make_checkpoint(plan, arm.dagger.rounds, job.store)
         return
     dataset = obtain(job, arm.demonstrations)
-    writers = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint, arm.policy) for run in runs}
+    own = {run.seed: partial(writing_checkpoint, job.store, run.checkpoint, arm.policy) for run in runs}
+    stacks = sorted({seed // arm.stack for seed in own})
+    writers = {seed: own.get(seed) for one in stacks for seed in range(one * arm.stack, (one + 1) * arm.stack)}
     kept_out = held_out(dataset.num_episodes, training.holdout)
     config = deepcopy(arm.policy)  # LeRobot writes the data set's features into it
     with timed(job.times, TRAINING, arm.id, len(runs)):

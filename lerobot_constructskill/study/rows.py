@@ -7,11 +7,12 @@ has one row for every run that failed or has not been made.
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
+from annotated_types import Ge
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.tables import VERSIONS, Table
@@ -34,6 +35,9 @@ LATER = ("clipped_steps",)
 ERRORS = Json("held-out errors in m2, data set to error", dict[str, float])
 
 
+Positive = Annotated[int, Ge(1)]
+
+
 class _Known(TypedDict, total=False):
     machine: str
 
@@ -42,8 +46,16 @@ KNOWN = Json("what is known of a study's making", _Known)
 """Of the file `PROVENANCE`."""
 
 
+class _Env(TypedDict):
+    task: str
+    episode_length: NotRequired[Positive | None]
+    obs_type: NotRequired[str]
+    perturb: NotRequired[str]
+    perturb_seed: NotRequired[int]
+
+
 class _Environment(TypedDict):
-    env: dict[str, Any]
+    env: _Env
 
 
 class _Settings(TypedDict):
@@ -59,10 +71,7 @@ def read_environments(root: Path) -> dict[str, dict[str, Any]]:
     Raises:
         InputError: its file is not a study's.
     """
-    envs = {name: of["env"] for name, of in SETTINGS.read(root / STUDY)["settings"].items()}
-    if bare := [name for name, env in envs.items() if not isinstance(env.get("task"), str)]:
-        raise InputError(f"'{root / STUDY}' does not say of its setting '{bare[0]}' what env.task is.")
-    return envs
+    return {name: of["env"] for name, of in SETTINGS.read(root / STUDY)["settings"].items()}
 
 
 def check_folder(root: Path) -> None:
@@ -175,7 +184,12 @@ def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
     Raises:
         InputError: the file does not hold such rows.
     """
-    return TABLES[kind].read(path).to_pandas(types_mapper=_nullable)
+    rows = TABLES[kind].read(path).to_pandas(types_mapper=_nullable)
+    if kind is Row and (wrong := {*rows["role"]} - {VARIANT, REFERENCE, SIGHTLESS}):
+        raise InputError(f"'{path}' is not {TABLES[kind].what}: there is no role {min(wrong)!a}.")
+    if kind is Row and (rows["episodes"] < 1).any():
+        raise InputError(f"'{path}' is not {TABLES[kind].what}: a run must have one episode or more.")
+    return rows
 
 
 def load_rows[Kind: EpisodeRow](path: Path, kind: type[Kind] = Row) -> list[Kind]:

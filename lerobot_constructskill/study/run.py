@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -144,9 +145,13 @@ def _provenance(root: Path) -> dict[str, Any]:
     """
     path = root / PROVENANCE
     facts = {"machine": ""} | (KNOWN.read(path) if path.exists() else {})
-    if bad := [name for name, value in facts.items() if name.endswith(", s") and not isinstance(value, int | float)]:
+    if bad := [name for name, value in facts.items() if name.endswith(", s") and not _is_time(value)]:
         raise InputError(f"'{path}': '{bad[0]}' must be a number of seconds, not {facts[bad[0]]!r}.")
     return facts
+
+
+def _is_time(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
 
 
 def _write_provenance(root: Path, earlier: dict[str, Any], before: dict[str, float], seconds: float) -> None:

@@ -32,7 +32,7 @@ from lerobot_constructskill.training.checkpoints import (
     settled_elsewhere,
 )
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import versions_of
+from lerobot_constructskill.training.trainers import trainer_of, versions_of
 
 OURS = "constructskill"
 """The one environment that a study evaluates in."""
@@ -111,6 +111,12 @@ class Arm:
         return f"{self.setting}/{self.name}"
 
     @property
+    def stack(self) -> int:
+        """How many of its seeds are trained as one computation: where each has demonstrations of its own, none are."""
+        own = self.demonstrations.moved or self.dagger
+        return 1 if own else trainer_of(self.policy).stack(self.policy)
+
+    @property
     def trained_on(self) -> Demonstrations | None:
         """The demonstrations that are all it is trained on; none where DAgger adds rounds to them.
 
@@ -143,7 +149,7 @@ class Run:
             return None
         if self.dagger:
             return self.dagger.checkpoint(arm.dagger.rounds)
-        return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec)
+        return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec, arm.stack)
 
     @cached_property
     def artifact(self) -> Artifact:

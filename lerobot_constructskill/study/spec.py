@@ -104,6 +104,9 @@ class Study:
         for kind in ("settings", "variants"):
             if not getattr(self, kind):
                 raise InputError(f"A study needs at least one of {kind}.")
+        for name, variant in self.variants.items():
+            if variant.training_seeds.stop > 2**31:
+                raise InputError(f"variants.{name}: its last training seed must be at most {2**31 - 1}.")
         names = [*self.settings, *self.variants, *self.references]
         if twice := [name for name in names if names.count(name) > 1]:
             raise InputError(

@@ -5,7 +5,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import NotRequired, TypedDict
+from typing import Annotated, NotRequired, TypedDict
+
+from annotated_types import Ge, Lt
 
 from lerobot_constructskill.files import Json, read_bytes
 
@@ -18,9 +20,9 @@ ROUNDS = "rounds of DAgger"
 
 class _Entry(TypedDict):
     stage: str
-    seconds: float
+    seconds: Annotated[float, Ge(0), Lt(1e9)]
     arm: NotRequired[str]
-    runs: NotRequired[int]
+    runs: NotRequired[Annotated[int, Ge(1)]]
 
 
 ENTRY = Json("the time of a piece of work", _Entry)
@@ -57,7 +59,7 @@ def seconds_per_run(root: Path) -> dict[str, dict[str, float]]:
     took: dict[str, dict[str, float]] = {}
     for entry in _entries(root):
         if "arm" in entry:
-            took.setdefault(entry["arm"], {})[entry["stage"]] = entry["seconds"] / entry["runs"]
+            took.setdefault(entry["arm"], {})[entry["stage"]] = entry["seconds"] / entry.get("runs", 1)
     return took
 
 

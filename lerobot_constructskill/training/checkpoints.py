@@ -69,10 +69,14 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
 
 
 def checkpoint_artifact(
-    policy: PreTrainedConfig, training: Training, seed: int, demonstrations: Mapping[str, Any]
+    policy: PreTrainedConfig, training: Training, seed: int, demonstrations: Mapping[str, Any], stack: int
 ) -> Artifact:
-    """What a training seed of a settled policy makes of demonstrations with this specification."""
-    facts = {"policy": policy_spec(policy), "training": asdict(training), "seed": seed}
+    """What a training seed of a settled policy makes of demonstrations with this specification.
+
+    Args:
+        stack: how many seeds are trained as one computation, `Trainer.stack` or 1.
+    """
+    facts = {"policy": policy_spec(policy), "training": asdict(training), "seed": seed, "stack": stack}
     made_by = versions(*LEARNING) | versions_of(policy)
     return Artifact("checkpoints", facts | {"demonstrations": demonstrations, "versions": made_by})
 

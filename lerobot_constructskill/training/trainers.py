@@ -61,6 +61,14 @@ class Trainer:
         """Whether `fit` should get many seeds at once. Where it raises, those failed that it has not written."""
         return False
 
+    def stack(self, config: PreTrainedConfig) -> int:
+        """How many seeds are one computation, whose bits may depend on all of them: 0 to 9, 10 to 19 and so on for 10.
+
+        `fit` then gets all seeds of such a stack, also those that nobody asked for: what is missing of a study shows
+        in nothing that is made.
+        """
+        return 1
+
     def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:
         """Return the configuration with everything written out that it leaves to the machine."""
         return config
@@ -87,7 +95,7 @@ class Trainer:
         self,
         config: PreTrainedConfig,
         demonstrations: LeRobotDataset,
-        writers: Mapping[int, Writer],
+        writers: Mapping[int, Writer | None],
         epochs: int,
         batch_size: int,
         held_out: Sequence[int],
@@ -95,7 +103,8 @@ class Trainer:
     ) -> None:
         """Train each seed of `writers` on the episodes that are not held out, and write its checkpoint.
 
-        A checkpoint is what `lerobot-eval --policy.path` loads.
+        A checkpoint is what `lerobot-eval --policy.path` loads. A seed of a stack that has no writer is trained with
+        the others and not kept.
         """
         raise NotImplementedError
 

@@ -4,10 +4,10 @@ import json
 import shutil
 import subprocess
 import sys
-import sysconfig
 from pathlib import Path
 
 import pytest
+import yaml
 
 from lerobot_constructskill.artifacts import revisions as module
 from lerobot_constructskill.artifacts.code import code_of
@@ -147,7 +147,7 @@ print({{name: _hash(*stamp(Path({str(PACKAGE)!r}) / name)) for name in {sorted(r
     found = sorted(Path.home().glob(f".pyenv/versions/{python}.*/bin/python")) or [shutil.which(f"python{python}")]
     if found[-1] is None:
         pytest.skip(f"no Python {python} here")
-    surroundings = {"PYTHONPATH": f"{REPOSITORY}:{sysconfig.get_path('purelib')}"}
+    surroundings = {"PYTHONPATH": f"{REPOSITORY}:{Path(yaml.__file__).parents[1]}"}
     done = subprocess.run([found[-1], "-c", code], env=surroundings, capture_output=True, text=True)
     assert done.stdout.strip() == str(sources(room)), done.stderr
 

@@ -181,7 +181,12 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     entry = read_entries(root).entries[0]
     (root / "verified").mkdir()
     path = root / "verified" / f"{entry.name}.json"
-    verdict = {"submission": entry.submission.sha256, "level": "replayed", "versions": {"sapien": "3"}, "date": ""}
+    verdict = {
+        "submission": entry.submission.sha256,
+        "level": "replayed",
+        "versions": {"sapien": "3"},
+        "date": "2026-11-28",
+    }
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
         assert read_entries(root).entries[0].level == level

@@ -201,7 +201,7 @@ def test_what_a_study_does_not_have_is_said(study, tmp_path):
     with pytest.raises(InputError, match="is not a study's file: settings.block.env: it is missing"):
         collected(row)
     (study / STUDY).write_text("settings: {block: {env: {}}}")
-    with pytest.raises(InputError, match="does not say of its setting 'block' what env.task is"):
+    with pytest.raises(InputError, match="is not a study's file: settings.block.env.task: it is missing"):
         collected(row)
     (study / STUDY).unlink()
     with pytest.raises(MissingError, match="study.yaml is missing"):

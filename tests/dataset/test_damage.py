@@ -6,14 +6,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import hostile
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
+from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.dataset.card import card_facts
+from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.hub import PUSHED, open_lerobot
 from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
+from lerobot_constructskill.files import bounded_memory
 from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
 
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
@@ -112,3 +117,53 @@ def test_what_is_pushed_is_an_allow_list(copy: Path) -> None:
     everything = [path.relative_to(copy).as_posix() for path in copy.rglob("*") if path.is_file()]
     pushed = set(filter_repo_objects(everything, allow_patterns=PUSHED))
     assert pushed == {name for name in everything if (copy / name).read_bytes() != b"secret"}
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["{chunk_index:0999999999d}", "{nope}", "{", "{0}", "/dev/zero", "../{video_key}", "{video_key.__class__}", 3],
+)
+def test_a_set_says_of_no_place_outside_of_it_where_its_videos_are(place, copy: Path) -> None:
+    info = json.loads((copy / "meta/info.json").read_text())
+    (copy / "meta/info.json").write_text(json.dumps(info | {"video_path": place}))
+    for read in (open_dataset, lambda root: open_lerobot("local/toy", root)):
+        with pytest.raises(InputError, match="video_path"):
+            read(copy)
+
+
+def test_a_set_that_says_of_a_billion_attempts_takes_no_memory(copy: Path) -> None:
+    facts = json.loads((copy / SIDECAR).read_text())
+    (copy / SIDECAR).write_text(json.dumps(facts | {"attempts": 10**9}))
+    with bounded_memory(300 << 20):
+        assert any(
+            "not those of the attempts" in said for said in complaints(open_dataset(copy), CHECKS["Provenance"])
+        )
+
+
+@pytest.mark.parametrize(
+    ("file", "column", "value"),
+    [
+        ("data/*/*.parquet", "phase", "zzz"),
+        ("data/*/*.parquet", "sim.seed", None),
+        ("data/*/*.parquet", "episode_index", "a"),
+        ("meta/episodes/*/*.parquet", "length", None),
+        ("meta/episodes/*/*.parquet", "dataset_from_index", "a"),
+    ],
+)
+def test_a_column_of_something_else_is_one_sentence(file, column, value, copy: Path) -> None:
+    path = next(copy.glob(file))
+    table = pq.read_table(path)
+    place = table.schema.get_field_index(column)
+    kind = table.schema.field(column).type if value is None else None
+    pq.write_table(table.set_column(place, column, pa.array([value] * len(table), kind)), path)
+    with pytest.raises(InputError, match=column):
+        data = open_dataset(copy)
+        card_facts(data)
+        data.column(column)
+
+
+def test_a_folder_that_holds_itself_is_walked_once(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "file").touch()
+    (tmp_path / "data" / "again").symlink_to(tmp_path / "data")
+    assert [path.name for path in files_below(tmp_path, "data")] == ["file"]

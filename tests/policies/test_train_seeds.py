@@ -108,8 +108,12 @@ def test_weights_do_not_depend_on_the_number_of_cores(readout, config, feature_s
     assert all(torch.equal(trained[0][name], trained[1][name]) for name in trained[0])
 
 
-def fit(config, feature_set, seeds, folder, monkeypatch):
-    """What a study has its trainer do, on features that are there: the weights of every seed, as they were written."""
+def fit(config, feature_set, seeds, folder, monkeypatch, beside=()):
+    """What a study has its trainer do, on features that are there: the weights of every seed, as they were written.
+
+    Args:
+        beside: seeds of the same stack that nobody asked for.
+    """
     monkeypatch.setattr(trainer, "obtain_features", lambda *_: feature_set)
     written = {}
 
@@ -118,9 +122,18 @@ def fit(config, feature_set, seeds, folder, monkeypatch):
         yield folder / str(seed)
         written[seed] = load_file(folder / str(seed) / "model.safetensors"), facts["heldout_mse_m2"]
 
-    writers = {seed: partial(write, seed) for seed in seeds}
+    writers = {seed: partial(write, seed) for seed in seeds} | dict.fromkeys(beside)
     FeatureTrainer().fit(config, feature_set, writers, EPOCHS, BATCH_SIZE, HELD_OUT, Store(folder / "store"))
     return written
+
+
+def test_what_is_missing_of_a_stack_shows_in_nothing(config, feature_set, tmp_path, monkeypatch):
+    """Bit for bit: all ten are trained whenever one of them is."""
+    whole = fit(config(), feature_set, range(10), tmp_path / "whole", monkeypatch)
+    rest = fit(config(), feature_set, [4, 7], tmp_path / "rest", monkeypatch, beside={*range(10)} - {4, 7})
+    assert rest.keys() == {4, 7}
+    for seed, (weights, error) in rest.items():
+        assert error == whole[seed][1] and all(torch.equal(one, whole[seed][0][name]) for name, one in weights.items())
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """What a policy does in an episode depends on that episode alone."""
 
+import json
+import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +10,7 @@ import torch
 from lerobot.policies.factory import make_policy_config
 
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.policies.frozen_vit.shared_eyes import BATCH, _Memory
 from lerobot_constructskill.rollout.agents import Lockstep, Observation, PolicyAgent
 
 SEEN = Observation({"pixels": {"base": np.zeros((1, 8, 8, 3), np.uint8)}}, {}, "put it there")
@@ -73,4 +76,32 @@ def test_an_adapter_is_no_policy(tmp_path):
     config = make_policy_config("act", device="cpu", use_peft=True, pretrained_backbone_weights=None)
     config.save_pretrained(tmp_path)
     with pytest.raises(InputError, match="is a PEFT adapter"):
+        PolicyAgent.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("new", [1, 15, 16, 17, 40])
+def test_a_gpu_always_encodes_as_many_frames_at_once(new):
+    """On a device without numbers: no GPU is needed to see what it would be given."""
+    given = []
+
+    def pool(batch):
+        given.append(len(batch))
+        return batch.flatten(1)
+
+    memory = _Memory(SimpleNamespace(pool=pool, backbone=SimpleNamespace(runtime="torch")))
+    encoded = memory._encode([torch.empty(1, 3, 4, 4, device="meta")] * new)
+    assert {*given} == {BATCH} and len(encoded) == new and encoded[0].shape == (1, 48)
+
+
+def test_a_checkpoint_calls_nothing_that_is_not_registered(tmp_path):
+    """LeRobot imports and calls whatever a step's `class` names."""
+    ran = tmp_path / "ran"
+    steps = [{"class": "os.system", "config": {"command": f"touch {ran}"}}]
+    (tmp_path / "policy_preprocessor.json").write_text(json.dumps({"name": "x", "steps": steps}))
+    with pytest.raises(InputError, match="steps.0.registry_name: it is missing"):
+        PolicyAgent.from_pretrained(tmp_path)
+    assert not ran.exists()
+    (tmp_path / "policy_preprocessor.json").unlink()
+    os.mkfifo(tmp_path / "model.safetensors")
+    with pytest.raises(InputError, match="model.safetensors' is not a regular file"):
         PolicyAgent.from_pretrained(tmp_path)

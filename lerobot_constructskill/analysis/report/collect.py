@@ -74,6 +74,9 @@ def check_rows(rows: pd.DataFrame) -> None:
         raise InputError(f"Setting '{bare[0]}' has no variant to report.")
     if len(lengths := sorted(rows["episodes"].unique())) > 1:
         raise InputError(f"One table has runs of {lengths[0]} and of {lengths[1]} episodes; report them separately.")
+    finished = rows[rows["error_kind"].isna()]
+    if bare := [name for name in CRITERIA if finished[name].isna().any()]:
+        raise InputError(f"Whether an episode of a run that finished was {bare[0]} is missing in its row.")
     twice = rows.duplicated([*RUN, "episode"])
     if twice.any():
         row = rows[twice].iloc[0]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from itertools import count
 from pathlib import Path
+from typing import Any, NotRequired, TypedDict
 
 import draccus
 import pandas as pd
@@ -21,6 +22,7 @@ from lerobot_constructskill.analysis.report.provenance import Film, extra_facts,
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wrong_order
 from lerobot_constructskill.artifacts.folders import write_text
+from lerobot_constructskill.bounds import Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
 from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, check_folder, read_rows
@@ -37,15 +39,24 @@ WORDS = (
 )
 """What templates may call as filters."""
 
-STUDY_FILE = Yaml("a study's file")
+
+class _Study(TypedDict):
+    name: str
+    analysis: NotRequired[dict[str, Any] | None]
+
+
+STUDY_FILE = Yaml("a study's file", _Study)
 
 
 @dataclass(frozen=True)
 class Heading:
     """What a report reads of a study's file: it takes everything else from the rows."""
 
-    name: str
+    name: Text
     analysis: Analysis = field(default_factory=Analysis)
+
+    def __post_init__(self):
+        check(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +77,8 @@ def write_report(root: Path) -> Path:
         InputError: one of them cannot be read, or they do not belong together.
     """
     heading, rows = read_study(root)
-    (root / "figures").mkdir(exist_ok=True)
     findings = collect(heading.analysis, rows)
+    (root / "figures").mkdir(exist_ok=True)
     context = {
         "name": heading.name,
         "study": read_text(root / STUDY),

@@ -86,7 +86,7 @@ def _versions(rows: pd.DataFrame) -> list[tuple[str, str]]:
 
 
 def _inside(root: Path, video: str) -> bool:
-    path = (root / video).resolve()
+    path = (root / video.replace("\0", "")).resolve()
     return path.is_relative_to(root.resolve()) and path.is_file()
 
 

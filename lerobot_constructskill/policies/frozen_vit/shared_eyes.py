@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Hashable, Mapping, Sequence
+from itertools import batched
 
 import torch
 from lerobot.policies import PreTrainedPolicy
@@ -15,6 +16,9 @@ type Batches = Mapping[int, dict]
 
 type Seen = dict[int, dict | Exception]
 """The same with what an encoder made of the image, or with the exception that it raised."""
+
+BATCH = 16
+"""Frames that a GPU encodes at once; of fewer the last is repeated."""
 
 
 class SharedEyes:
@@ -82,7 +86,12 @@ class _Memory:
     def _encode(self, images: list[Tensor]) -> Sequence[Tensor]:
         if not images:
             return []
-        if self.policy.backbone.runtime == "torch" and images[0].device.type == "cpu":
+        if images[0].device.type != "cpu":
+            # A GPU's sums depend on the size of a batch, and how many frames are new on what runs beside.
+            whole = [*images, *[images[-1]] * (-len(images) % BATCH)]
+            pooled = [self.policy.pool(torch.cat(some)) for some in batched(whole, BATCH)]  # noqa: B911
+            return torch.cat(pooled).split(1)[: len(images)]
+        if self.policy.backbone.runtime == "torch":
             return [self.policy.pool(image) for image in images]  # batches are no faster here, and round differently
         return self.policy.pool(torch.cat(images)).split(1)
 
