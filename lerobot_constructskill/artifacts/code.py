@@ -16,14 +16,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.digests import file_sha256, installed, stamp
-from lerobot_constructskill.artifacts.revisions import PACKAGE, revisions
+from lerobot_constructskill.artifacts.revisions import LEFT_OUT, PACKAGE, revisions
 from lerobot_constructskill.errors import MachineError
 
 BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
 """Top-level packages whose source is not hashed: LeRobot's version says enough, and our own code has revisions."""
-
-_LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$)")
-"""Files beside a package's own: hidden ones, bytecode, logs, and what editors leave for as long as a file is open."""
 
 
 def code_of(*names: str) -> dict[str, str]:
@@ -31,7 +28,7 @@ def code_of(*names: str) -> dict[str, str]:
 
     LeRobot's code is left out, and ours is told by `revisions`. Other code is told by its version, where it is
     installed, and by the start of a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the
-    top-level package, meshes and settings too, but for `_LEFT_OUT`; and of packages that it imports and that are of
+    top-level package, meshes and settings too, but for `LEFT_OUT`; and of packages that it imports and that are of
     the same distribution, or of none. Other distributions that it imports are not told.
 
     Args:
@@ -129,7 +126,7 @@ def _files(package: str) -> dict[str, Path]:
         spec = None
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     inside = {path.relative_to(folder).as_posix(): path for folder in folders for path in folder.rglob("*")}
-    found = {name: path for name, path in inside.items() if path.is_file() and not _LEFT_OUT.search(name)}
+    found = {name: path for name, path in inside.items() if path.is_file() and not LEFT_OUT.search(name)}
     if spec and spec.origin and spec.origin.endswith(".py"):
         found.setdefault(Path(spec.origin).name, Path(spec.origin))
     return found

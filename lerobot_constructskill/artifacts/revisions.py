@@ -16,7 +16,9 @@ import argparse
 import ast
 import hashlib
 import json
+import re
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypedDict
@@ -29,6 +31,9 @@ PACKAGE = Path(__file__).parents[1]
 TABLE = Path(__file__).with_name("revisions.json")
 PREFIX = "constructskill."
 """Before a room's name where it stands beside those of packages."""
+
+LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$)")
+"""Files beside a package's own: hidden ones, bytecode, logs, and what editors leave for as long as a file is open."""
 
 EDITED = "edited: "
 """Before the file where the source stands in place of a revision."""
@@ -104,7 +109,8 @@ def files_of(room: Room) -> Iterator[Path]:
         if not (path := PACKAGE / name).exists():
             raise MachineError(f"{path}, of the table of revisions, is not there: install the package again.")
         inside = sorted(path.rglob("*")) if path.is_dir() else [path]
-        yield from (one for one in inside if one.is_file() and "__pycache__" not in one.parts)
+        named = {one.relative_to(PACKAGE).as_posix(): one for one in inside if one.is_file()}
+        yield from (one for name, one in named.items() if not LEFT_OUT.search(name))
 
 
 def _is_in(module: str, holds: list[str]) -> bool:
@@ -115,9 +121,10 @@ def _is_in(module: str, holds: list[str]) -> bool:
 
 @cache
 def _hash(path: Path, size: int, mtime_ns: int) -> str:
-    if path.suffix != ".py":
-        return file_sha256(path)[:16]
-    return hashlib.sha256(repr(_plain(ast.parse(path.read_bytes()))).encode()).hexdigest()[:16]
+    with suppress(SyntaxError, ValueError, RecursionError):  # of a line that is half written
+        if path.suffix == ".py":
+            return hashlib.sha256(repr(_plain(ast.parse(path.read_bytes()))).encode()).hexdigest()[:16]
+    return file_sha256(path)[:16]
 
 
 def _plain(node: Any) -> Any:

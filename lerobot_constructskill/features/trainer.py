@@ -5,7 +5,7 @@ from concurrent.futures import BrokenExecutor
 from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +78,11 @@ class FeatureTrainer:
         return written if READOUTS[config.readout].points else (*written, "point_weight")
 
     def settled_elsewhere(self, config: FrozenViTChunkConfig) -> list[dict[str, Any]]:
-        """The precisions that `auto` means on other machines."""
+        """The precisions that `auto` means on other machines, and those of the CPU where this is a GPU."""
         here = resolve_precision(config.backbone_precision, config.device)
-        others = PRECISIONS if config.backbone_precision == AUTO else ()
-        return [{"backbone_precision": one} for one in others if one != here]
+        precisions = PRECISIONS if config.backbone_precision == AUTO else [here]
+        kinds = product(dict.fromkeys([config.device, "cpu"]), precisions)
+        return [{"device": d, "backbone_precision": one} for d, one in kinds if (d, one) != (config.device, here)]
 
     @contextmanager
     def joined(

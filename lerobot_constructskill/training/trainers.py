@@ -27,8 +27,8 @@ OF_THE_MACHINE = (
 BY_LEROBOT = "lerobot_constructskill.training.lerobot_train:LeRobotTrainer"
 """What trains policies whose configuration names nothing else."""
 
-ELSEWHERE = ("device", "push_to_hub", "repo_id", "private", "tags", "license")
-"""Fields of every policy that say where it computes or is published, and not what it becomes."""
+ELSEWHERE = ("push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of every policy that say where it is published, and not what it becomes."""
 
 type Writer = Callable[..., AbstractContextManager[Path]]
 """Gives the path of a folder that is not there yet; the checkpoint appears when the block ends. It takes what rows are
@@ -78,8 +78,11 @@ class Trainer:
         return ()
 
     def settled_elsewhere(self, config: PreTrainedConfig) -> list[dict[str, Any]]:
-        """The fields that machines of another kind would write out otherwise: one dictionary for each kind."""
-        return []
+        """The fields that machines of another kind would write out otherwise: one dictionary for each kind.
+
+        Of a GPU that this machine does not have nothing can be known: LeRobot takes the CPU in its place.
+        """
+        return [] if config.device == "cpu" else [{"device": "cpu"}]
 
     @contextmanager
     def joined(
@@ -130,7 +133,9 @@ def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
     A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for whatever
     it holds, unless `pretrained_revision` says which commit.
     """
-    fields = draccus.encode(config)
+    fields = draccus.encode(config) | {
+        "device": str(config.device).partition(":")[0]
+    }  # which of several does not show
     trainer = trainer_of(config)
     for name in (*ELSEWHERE, *trainer.places, *trainer.idle(config)):
         fields.pop(name, None)

@@ -101,7 +101,10 @@ def test_what_is_said_and_laid_out_does_not_count(before, after, counts, copy):
 def test_a_file_that_is_new_or_gone_is_an_edit(copy):
     (copy / "demos" / "more.py").write_text("X = 1\n")
     assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/more.py")
-    (copy / "demos" / "more.py").unlink()
+    (copy / "demos" / "more.py").write_text("X = [\n")
+    assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/more.py"), "half written"
+    (copy / "demos" / "more.py").rename(copy / "demos" / ".more.py.swp")
+    assert revisions(DEMOS)["constructskill.demos"] == "1", "of an editor"
     (copy / "demos" / "stance.py").unlink()
     assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/stance.py")
 

@@ -14,6 +14,7 @@ from lerobot_constructskill.artifacts.store import Artifact, Store
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.training.checkpoints import check_inputs, writing_checkpoint
 from lerobot_constructskill.training.lerobot_train import LOG, _call
+from lerobot_constructskill.training.trainers import Trainer, policy_spec
 
 
 def run(code: str, folder: Path) -> None:
@@ -113,3 +114,10 @@ def test_a_policy_of_others_that_names_no_inputs_is_not_taken_to_read_the_state(
     check_inputs(SimpleNamespace(input_features=None), "pixels")
     with pytest.raises(InputError, match="reads observation.state"):
         check_inputs(ACTConfig(), "pixels")
+
+
+def test_a_gpus_checkpoint_is_another_and_a_studys_rows_of_a_cpu_are_found_beside_a_gpu():
+    here, there = ACTConfig(device="cpu"), ACTConfig(device="cpu")
+    there.device = "cuda:1"  # as on a machine that has one: LeRobot takes the CPU here
+    assert policy_spec(here)["device"] == "cpu" and policy_spec(there) == policy_spec(here) | {"device": "cuda"}
+    assert Trainer().settled_elsewhere(here) == [] and Trainer().settled_elsewhere(there) == [{"device": "cpu"}]
