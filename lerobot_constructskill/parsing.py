@@ -177,7 +177,7 @@ _WANTED = {
 
 
 def _is_plain(kind: Any) -> bool:
-    return kind in _WANTED or get_origin(kind) in (list, tuple, dict) or (is_dataclass(kind) and bool(kind))
+    return kind in (*_WANTED, dict) or get_origin(kind) in (list, tuple, dict) or is_dataclass(kind)
 
 
 def _fits(kind: Any, value: Any) -> bool:
@@ -194,9 +194,9 @@ def _fits(kind: Any, value: Any) -> bool:
         case str():
             return kind in TEXTS or (kind is float and _is_number(value))
         case list() | tuple():
-            return get_origin(kind) in (list, tuple)
+            return (get_origin(kind) or kind) in (list, tuple)
         case Mapping():
-            return is_dataclass(kind) or get_origin(kind) is dict
+            return is_dataclass(kind) or (get_origin(kind) or kind) is dict
     return True
 
 

@@ -44,7 +44,10 @@ def read_policy(checkpoint: Path | str, **overrides: Any) -> PreTrainedConfig:
     flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
     if (file := Path(checkpoint) / "config.json").exists():
         saved = CONFIGURATION.read(file)
-        check_kinds(PreTrainedConfig, saved, f"'{file}': ")
+        try:
+            check_kinds(PreTrainedConfig, saved)
+        except InputError as error:
+            raise InputError(f"'{file}': {error}") from None
     with as_input():
         try:
             return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)

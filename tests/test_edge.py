@@ -1,8 +1,10 @@
 """Every field of every console command, by introspection, with values that break things: a sentence, or valid."""
 
 import importlib
+import json
 import math
 import tomllib
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -198,3 +200,18 @@ def test_a_policys_own_fields_are_looked_at_too() -> None:
         decode_policy({"type": "act", "optimizer_lr": True})
     assert decode_policy({"type": "act", "replace_final_stride_with_dilation": True})
     assert decode_policy({"type": "frozen_vit", "optimizer_lr": "1e-3"}).optimizer_lr == 1e-3
+
+
+def test_every_policy_that_is_installed_is_read_as_it_was_written() -> None:
+    """LeRobot's annotations are not always those of the values: what its own defaults are is no mistake."""
+    import draccus
+    import lerobot.policies  # noqa: F401  registers the policies
+    from lerobot.configs import PreTrainedConfig
+
+    read = []
+    for name, kind in PreTrainedConfig.get_known_choices().items():
+        with suppress(OSError):  # two ask the Hub for what they are built on
+            written = json.loads(json.dumps(draccus.encode(kind())))
+            parsing.check_kinds(PreTrainedConfig, {"type": name, **written})
+            read.append(name)
+    assert {"act", "diffusion", "smolvla", "pi05", "frozen_vit"} <= {*read}
