@@ -147,11 +147,12 @@ from pathlib import Path
 from lerobot_constructskill.artifacts.revisions import _hash, stamp
 print({{name: _hash(*stamp(Path({str(PACKAGE)!r}) / name)) for name in {sorted(room["sources"])}}})
 """
-    found = sorted(Path.home().glob(f".pyenv/versions/{python}.*/bin/python")) or [shutil.which(f"python{python}")]
-    if found[-1] is None:
+    found = [*sorted(Path.home().glob(f".pyenv/versions/{python}.*/bin/python")), f"python{python}"]
+    starts = [one for one in found if shutil.which(one) and not subprocess.run([one, "-c", ""]).returncode]
+    if not starts:  # of pyenv, there are also stand-ins for what a folder has not chosen
         pytest.skip(f"no Python {python} here")
     surroundings = {"PYTHONPATH": f"{REPOSITORY}:{Path(yaml.__file__).parents[1]}"}
-    done = subprocess.run([found[-1], "-c", code], env=surroundings, capture_output=True, text=True)
+    done = subprocess.run([starts[0], "-c", code], env=surroundings, capture_output=True, text=True)
     assert done.stdout.strip() == str(sources(room)), done.stderr
 
 
