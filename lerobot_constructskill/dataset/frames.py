@@ -108,6 +108,8 @@ def pictures(data: DataSet, camera: str) -> Iterator[tuple[int, np.ndarray]]:
     paths = dict.fromkeys(data.video(camera, episode) for _, episode in data.episodes.iterrows())
     row = 0
     for path in paths:
+        if not path.is_file():  # a pipe would be waited for
+            raise InputError(f"{path.relative_to(data.root)} is missing, or no regular file.")
         try:
             with av.open(str(path)) as video:
                 for frame in video.decode(video=0):

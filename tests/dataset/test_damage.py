@@ -19,6 +19,7 @@ from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_out
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import bounded_memory
+from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
 
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
@@ -167,3 +168,11 @@ def test_a_folder_that_holds_itself_is_walked_once(tmp_path: Path) -> None:
     (tmp_path / "data" / "file").touch()
     (tmp_path / "data" / "again").symlink_to(tmp_path / "data")
     assert [path.name for path in files_below(tmp_path, "data")] == ["file"]
+
+
+@pytest.mark.parametrize("way", ["a pipe", "a device", "a link to nothing", "a folder"])
+def test_a_video_that_is_no_file_is_waited_for_by_nobody(way, copy: Path) -> None:
+    video = next(copy.glob("videos/*/*/*.mp4"))
+    hostile.WAYS[way](video)
+    with pytest.raises(InputError, match=video.name):
+        write_card(CardConfig(copy))
