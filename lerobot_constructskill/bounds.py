@@ -173,7 +173,7 @@ def _complaint(value: Any, kind: Any) -> str | None:
         if get_origin(base) is list and _is_list(value) and (complaint := _complaint(value, base)):
             return complaint  # of an item, which the rules of the list say nothing about
         wrong = [rule for rule in rules if _complaint(value, base) or not rule.allows(value)]
-        return wrong[0].wanted(_NAMES.get(base, "a value")) if wrong else None
+        return wrong[0].wanted(NAMES.get(base, "a value")) if wrong else None
     if origin in (Union, UnionType):
         if value is None and NoneType in inner:
             return None
@@ -187,7 +187,7 @@ def _complaint(value: Any, kind: Any) -> str | None:
             return "a mapping of names to values"
         wrong = [complaint for pair in value.items() for complaint in map(_complaint, pair, inner) if complaint]
         return f"a mapping, with {wrong[0]} in place of what is there" if wrong else None
-    return None if kind not in _TESTS or _TESTS[kind](value) else _NAMES[kind]
+    return None if kind not in _TESTS or _TESTS[kind](value) else NAMES[kind]
 
 
 def _wanted_of(kind: Any) -> str:
@@ -204,7 +204,7 @@ def _is_number(value: Any) -> bool:
 
 
 _NOTHING = object()
-_NAMES = {
+NAMES = {
     int: "a whole number",
     float: "a finite number",
     bool: "true or false",

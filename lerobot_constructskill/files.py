@@ -223,12 +223,16 @@ class Yaml[Kind](Json[Kind]):
         return self.parse(read_text(path, MOST_YAML), f"'{path}'")
 
     def parse(self, text: str, where: str) -> Kind:
-        return _plain(lambda: self._checked(_whole(yaml.load(text, self.loader))), f"{where} is not {self.what}")
+        return _plain(lambda: self._checked(_yaml(text, self.loader)), f"{where} is not {self.what}")
 
 
 def parse_yaml(text: str, where: str, loader: type[Loader] = Loader) -> Any:
     """The value of a text that stands at `where`. Raises InputError where it is no YAML."""
-    return _plain(lambda: _whole(yaml.load(text, loader)), f"{where} cannot be read")
+    return _plain(lambda: _yaml(text, loader), f"{where} cannot be read")
+
+
+def _yaml(text: str, loader: type[Loader]) -> Any:
+    return _whole(yaml.load(text, loader))
 
 
 def _whole(value: Any) -> Any:
@@ -278,7 +282,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, most: int | N
                 raise InputError(f"'{path}' unpacks to more than {most:,} bytes.")
             if absent := [name for name in columns or () if name not in file.schema_arrow.names]:
                 raise InputError(f"'{path}' has no column {absent[0]}.")
-            table = file.read(columns)
+            table = file.read(columns, use_threads=most is None)  # of a small table they only take memory
             table.validate(full=True)
     except FileNotFoundError:
         raise MissingError(f"There is no file '{path}'.") from None

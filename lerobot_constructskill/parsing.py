@@ -15,13 +15,16 @@ import draccus
 import mergedeep
 
 from lerobot_constructskill import tags
-from lerobot_constructskill.bounds import LONGEST
+from lerobot_constructskill.bounds import LONGEST, NAMES
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.files import Json, parse_yaml
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find
 
 OURS = Path(__file__).parent
+
+CONFIGURATION = Json("a configuration")
+"""One in JSON; one in YAML may have our tags."""
 
 
 def parse[Config](
@@ -102,7 +105,7 @@ def _value(text: str, kind: Any) -> Any:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    read = Json("a configuration").read(path) if path.suffix == ".json" else tags.read(path)
+    read = CONFIGURATION.read(path) if path.suffix == ".json" else tags.read(path)
     if not isinstance(read, dict):
         raise InputError(f"'{path}' is empty or is not a mapping of fields.")
     return read
@@ -163,17 +166,8 @@ def _hints(config_class: type) -> dict[str, Any]:
 
 
 TEXTS = {str, Path, NoneType}
-_WANTED = {
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-    str: "text",
-    Path: "a path",
-    NoneType: "nothing",
-    list: "a list",
-    tuple: "a list",
-}
-"""What a value of a kind is called; others are mappings."""
+_WANTED = NAMES | {float: "a number", NoneType: "nothing", list: "a list", tuple: "a list"}
+"""What a value of a kind is called; others are mappings. Whether a number is finite is for `bounds`."""
 
 
 def _is_plain(kind: Any) -> bool:

@@ -9,13 +9,13 @@ are there to show:
     python -m lerobot_constructskill.artifacts.revisions --keep demos
 
 A room whose source is not that of the table, for somebody edited it, is told by its source in place of its number.
-Standard library only.
 """
 
 import argparse
 import ast
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator
 from contextlib import suppress
@@ -101,16 +101,20 @@ def sources(room: Room) -> dict[str, str]:
     Raises:
         MachineError: one of its files or folders is not there.
     """
-    return {path.relative_to(PACKAGE).as_posix(): _hash(*stamp(path)) for path in files_of(room)}
+    return {name: _hash(*stamp(PACKAGE / name)) for name in files_of(room)}
 
 
-def files_of(room: Room) -> Iterator[Path]:
-    for name in room["holds"]:
-        if not (path := PACKAGE / name).exists():
+def files_of(room: Room) -> Iterator[str]:
+    """The files of a room, by their paths below the package. It is asked for with every specification."""
+    above = len(f"{PACKAGE}{os.sep}")
+    for held in room["holds"]:
+        if not os.path.exists(path := f"{PACKAGE}{os.sep}{held}"):
             raise MachineError(f"{path}, of the table of revisions, is not there: install the package again.")
-        inside = sorted(path.rglob("*")) if path.is_dir() else [path]
-        named = {one.relative_to(PACKAGE).as_posix(): one for one in inside if one.is_file()}
-        yield from (one for name, one in named.items() if not LEFT_OUT.search(name))
+        if os.path.isfile(path):
+            yield held
+        for folder, _, names in os.walk(path):
+            inside = (f"{folder[above:]}/{name}" for name in sorted(names))
+            yield from (one for one in inside if not LEFT_OUT.search(one))
 
 
 def _is_in(module: str, holds: list[str]) -> bool:

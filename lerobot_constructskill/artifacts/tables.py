@@ -21,7 +21,7 @@ _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_
 
 
 @dataclass(frozen=True)
-class Table:
+class Parquet:
     """Parquet files whose columns are a dataclass' fields, of which those that may be None may be null.
 
     Args:

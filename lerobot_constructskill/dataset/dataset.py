@@ -146,13 +146,13 @@ def open_dataset(root: Path) -> DataSet:
         FileNotFoundError: there is no data set at `root`.
         ValueError: a file that cannot be read, or that lacks what every data set has; the message names it.
     """
-    check_is_there(root)
+    info = read_info(root)
     tasks = _tables(root, "meta/tasks.parquet").reset_index()
     if "task_index" not in tasks:
         raise InputError("meta/tasks.parquet has no column task_index.")
     data = DataSet(
         root=root,
-        info=read_facts(root, INFO, DATA_SET),
+        info=info,
         stats=read_facts(root, "meta/stats.json", STATISTICS),
         facts=read_provenance(root),
         rows=_tables(root, "data/*/*.parquet"),
@@ -171,18 +171,20 @@ def open_dataset(root: Path) -> DataSet:
     return data
 
 
-def check_is_there(root: Path) -> None:
-    """Refuse a folder without a data set, or whose videos would lie elsewhere.
+def read_info(root: Path) -> Facts:
+    """LeRobot's description of a data set.
 
     Raises:
         MissingError: meta/info.json, which every data set has, is missing.
-        InputError: it is not LeRobot's description of one.
+        InputError: it is something else, or its videos would lie elsewhere.
     """
     if not (root / INFO).is_file():
         raise MissingError(f"There is no data set in {root}: {INFO} is missing.")
-    template = DATA_SET.read(root / INFO).get("video_path")
+    info = read_facts(root, INFO, DATA_SET)
+    template = info.get("video_path")
     if template is not None and not (PLACE.fullmatch(template) and ".." not in template):
         raise InputError(f"video_path in '{root / INFO}' is no place in the data set: {template[:100]!a}.")
+    return info
 
 
 def read_provenance(root: Path) -> Facts:

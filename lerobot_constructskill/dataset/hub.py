@@ -102,10 +102,10 @@ def open_lerobot(
     """
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_constructskill.dataset.dataset import check_is_there
+    from lerobot_constructskill.dataset.dataset import read_info
 
     if root is not None:
-        check_is_there(root)
+        read_info(root)
     try:
         with one_sentence(repo_id, revision):
             dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.dataset.dataset import check_is_there
+from lerobot_constructskill.dataset.dataset import read_info
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
 
@@ -39,7 +39,7 @@ def split_of(root: Path) -> Split:
         MissingError: there is no data set.
         InputError: its episodes cannot be read, or LeRobot cannot split them as the contract does.
     """
-    check_is_there(root)
+    read_info(root)
     files = sorted(root.glob("meta/episodes/*/*.parquet"))
     tables = [read_parquet(file, SCHEMA.names) for file in files]
     for file, table in zip(files, tables, strict=True):

@@ -20,7 +20,7 @@ from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
-from lerobot_constructskill.artifacts.tables import VERSIONS, Table
+from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.perturbations import Perturbation
 
@@ -117,7 +117,7 @@ class Recording(Outcome):
 
 ACTIONS = pa.list_(pa.field("element", pa.float32(), nullable=False))
 
-TABLE = Table(
+TABLE = Parquet(
     "a recording", Recording, {list[np.ndarray]: ACTIONS}, later=("clipped_steps",), json={"versions": VERSIONS}
 )
 

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from annotated_types import Ge
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.tables import VERSIONS, Table
+from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.files import Json, Yaml
 
@@ -161,8 +161,8 @@ class Row(EpisodeRow):
 
 
 TABLES = {
-    EpisodeRow: Table("a table of a run's rows", EpisodeRow, later=LATER, json={"versions": VERSIONS}),
-    Row: Table(
+    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, later=LATER, json={"versions": VERSIONS}),
+    Row: Parquet(
         "a table of a study's rows",
         Row,
         later=LATER,

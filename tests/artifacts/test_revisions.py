@@ -44,7 +44,7 @@ def edit(path: Path, before: str, after: str) -> None:
 
 
 def test_every_file_is_in_one_room_or_decides_nothing():
-    held = [path for room in read_table().values() for path in files_of(room)]
+    held = [path for room in read_table().values() for path in paths_of(room)]
     inert = {path for path in PACKAGE.rglob("*") if any((PACKAGE / one) in (path, *path.parents) for one in INERT)}
     every = {path for path in PACKAGE.rglob("*") if path.is_file() and "__pycache__" not in path.parts}
     assert len(held) == len({*held}) and not inert & {*held}
@@ -62,13 +62,17 @@ def test_a_room_stands_on_what_it_imports():
     from test_architecture import SOURCES, imports
 
     rooms = read_table()
-    room_of = {path: name for name, room in rooms.items() for path in files_of(room)}
+    room_of = {path: name for name, room in rooms.items() for path in paths_of(room)}
     for name, room in rooms.items():
-        told = {one.removeprefix("constructskill.") for one in revisions(*(dotted(path) for path in files_of(room)))}
-        targets = {found.target for path in files_of(room) if path.suffix == ".py" for found in imports(path)}
+        told = {one.removeprefix("constructskill.") for one in revisions(*(dotted(path) for path in paths_of(room)))}
+        targets = {found.target for path in paths_of(room) if path.suffix == ".py" for found in imports(path)}
         met = {room_of.get(SOURCES[target]) for target in targets if target in SOURCES} - {None}
         assert met <= told | {*room["takes"]}, name
         assert {*room["stands_on"], *room["takes"]} <= rooms.keys() and name in told
+
+
+def paths_of(room) -> list[Path]:
+    return [PACKAGE / name for name in files_of(room)]
 
 
 def dotted(path: Path) -> str:

@@ -27,6 +27,8 @@ from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
+SAVED = Json("a policy's configuration")
+
 SILENT = 1e-3
 """A feature whose standard deviation is below this share of the median one is not divided by it."""
 logger = logging.getLogger(__name__)
@@ -276,7 +278,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _check_inputs(self, path: Path) -> None:
         """Refuse what would make other numbers of the same shape of the heads' input or output than in training."""
-        saved = Json("a policy's configuration").read(path) if path.is_file() else {}
+        saved = SAVED.read(path) if path.is_file() else {}
         for name in ("backbone", "readout", "crop", "blind", "gripper_head", "action_scale"):
             asked = getattr(self.config, name)
             asked = list(asked) if isinstance(asked, tuple) else asked
