@@ -112,9 +112,9 @@ def files_of(room: Room) -> Iterator[str]:
             raise MachineError(f"{path}, of the table of revisions, is not there: install the package again.")
         if os.path.isfile(path):
             yield held
-        for folder, _, names in os.walk(path):
-            inside = (f"{folder[above:]}/{name}" for name in sorted(names))
-            yield from (one for one in inside if not LEFT_OUT.search(one))
+        for folder, _, names in sorted(os.walk(path)):
+            files = [one for name in sorted(names) if os.path.isfile(one := f"{folder}{os.sep}{name}")]
+            yield from (one[above:] for one in files if not LEFT_OUT.search(one[above:]))
 
 
 def _is_in(module: str, holds: list[str]) -> bool:

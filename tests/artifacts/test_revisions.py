@@ -109,6 +109,8 @@ def test_a_file_that_is_new_or_gone_is_an_edit(copy):
     assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/more.py"), "half written"
     (copy / "demos" / "more.py").rename(copy / "demos" / ".more.py.swp")
     assert revisions(DEMOS)["constructskill.demos"] == "1", "of an editor"
+    (copy / "demos" / "link.py").symlink_to("nowhere.py")
+    assert revisions(DEMOS)["constructskill.demos"] == "1", "a link to nothing"
     (copy / "demos" / "stance.py").unlink()
     assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/stance.py")
 
