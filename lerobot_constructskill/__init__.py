@@ -9,12 +9,12 @@ dagger      rounds that a policy drives and the expert labels
 rollout     agents in lockstep, references, simulators, errors offline
 dataset     what one does with a data set that is there
 demos       experts, noise, recorder
-training    how any LeRobot policy is trained in a study
-features    a data set through an encoder, once
+training    how any LeRobot policy is trained and validated in a study
+features    a data set through an encoder, once; frozen_vit's trainer
 envs        what LeRobot sees
 sim         the simulator
 policies    frozen_vit
-artifacts   folders that are found by what made them
+artifacts   nodes and the store that makes them: specifications, digests, revisions of our code, locks, worker pools
 files       how a file is read that another may have written: JSON, YAML, Parquet
 parsing     flags and files into configurations; bounds, tags and presets are what it reads by
 errors      what is meant for the user

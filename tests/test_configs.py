@@ -28,8 +28,8 @@ from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.config import TrainingFile, write
 from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import VARIANT
-from lerobot_constructskill.study.runs import list_runs
 from lerobot_constructskill.study.spec import Study
 from lerobot_constructskill.training.recipe import Training
 
@@ -85,7 +85,7 @@ def test_executed_labels_differ_from_fast_in_the_labels_alone():
 def test_a_study_is_runs_that_can_be_made(path):
     """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
     for run in list_runs(parse(StudyConfig, [], path).study):
-        assert all(run.arm.env["task"] == data.config.task for data in run.arm.validated_on)
+        assert all(run.arm.env["task"] == data.node.config.task for data in run.arm.validated_on)
 
 
 @pytest.mark.parametrize("name", ["perturbed", "perturbed_paper"])
@@ -112,7 +112,7 @@ def test_no_two_sets_of_a_setting_are_one(path):
 
 def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
     study = parse(StudyConfig, [], CONFIGS / "study" / "precise_parts.yaml").study
-    sets = {run.arm.name: run.arm.demonstrations.config for run in list_runs(study)}
+    sets = {run.arm.name: run.arm.demonstrations.node.config for run in list_runs(study)}
     precise, av1, quiet = (sets[name] for name in ("precise", "av1_video", "quiet_release"))
     assert replace(av1, video="lossless") == precise != av1
     assert replace(quiet, noise=precise.noise) == precise != quiet
@@ -121,7 +121,7 @@ def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
 def test_the_dose_response_is_six_doses_of_one_set():
     study = parse(StudyConfig, [], CONFIGS / "study" / "dart_dagger.yaml").study
     runs = [run for run in list_runs(study) if run.arm.setting == "frames_4k" and run.arm.demonstrations]
-    sets = {run.arm.name: run.arm.demonstrations.config for run in runs}
+    sets = {run.arm.name: run.arm.demonstrations.node.config for run in runs}
     doses = {0: "clean", 10: "fixed"} | {millimetres: f"sigma_{millimetres}mm" for millimetres in (2, 5, 20, 30)}
     fixed = sets["fixed"]
     for millimetres, name in doses.items():
@@ -154,7 +154,7 @@ def test_the_papers_recipe_is_the_papers():
     config = parse(StudyConfig, [], CONFIGS / "study" / "paper.yaml")
     arms = {run.arm.name: run.arm for run in list_runs(config.study) if run.arm.role == VARIANT}
     for name in arms.keys() - {"converged"}:
-        policy, optimizer = arms[name].policy, arms[name].policy.get_optimizer_preset()
+        policy, optimizer = arms[name].learner.config, arms[name].learner.config.get_optimizer_preset()
         assert arms[name].training == Training(epochs=150, batch_size=256, holdout=8)
         assert (type(optimizer), optimizer.lr) == (AdamWConfig, 1e-3) and policy.get_scheduler_preset() is None
     assert Study.__dataclass_fields__["episodes"].default == 10
@@ -204,7 +204,7 @@ def study_of(tmp_path):
 def test_a_policy_is_named_in_a_file_that_lies_anywhere(path, study_of):
     fields = yaml.safe_load(path.read_text())
     (run, *_) = list_runs(study_of(f"!policy {path.stem}").study)
-    assert fields == {name: getattr(run.arm.policy, name) for name in fields}
+    assert fields == {name: getattr(run.arm.learner.config, name) for name in fields}
     with_another = study_of(f"!policy {{preset: {path.stem}, camera: base, crop: [0, 0, 0.5, 0.5]}}").study
     assert with_another.variants["ours"].policy == fields | {"camera": "base", "crop": [0, 0, 0.5, 0.5]}
 

@@ -15,7 +15,7 @@ import pytest
 from commands import BIN, call
 
 from lerobot_constructskill import contract, other_tasks
-from lerobot_constructskill.demos.obtain import artifact
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
@@ -117,7 +117,7 @@ def test_demonstrations_of_an_edited_scene_are_others(install, tmp_path, monkeyp
     found = []
     for length in ("0.20", "0.21"):
         (tmp_path / "lay.py").write_text(f"LENGTH = {length}\n")
-        found.append((frames_digest(config), artifact(config).digest))
+        found.append((frames_digest(config), Demonstrations(config).digest))
     assert all(before != after for before, after in zip(*found, strict=True))
 
 

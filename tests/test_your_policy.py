@@ -26,8 +26,8 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, study
 from lerobot_constructskill.scripts.submit import SubmitConfig, submit
 from lerobot_constructskill.scripts.verify import VerifyConfig, verify
+from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import read_rows
-from lerobot_constructskill.study.runs import list_runs
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -90,7 +90,7 @@ def config(folder: Path, *flags: str) -> StudyConfig:
 
 def digests(folder: Path) -> dict[str, str]:
     """Of all runs, as the plugin is now."""
-    return {run.id: run.artifact.digest for run in list_runs(config(folder).study)}
+    return {run.id: run.digest for run in list_runs(config(folder).study)}
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +165,7 @@ def interrupt(pushed: list, policy, told) -> None:
 
 def read_to_drive(checkpoint: Path, demonstrations: Path, out: Path) -> None:
     """As far as the plan of its rounds."""
-    assert Plan(DaggerConfig("local/driven", {"type": TYPE})).policy.type == TYPE
+    assert Plan.of(DaggerConfig("local/driven", {"type": TYPE})).learner.config.type == TYPE
 
 
 @pytest.mark.parametrize("command", [read_offline, read_to_fit_noise, read_to_push, read_to_drive])

@@ -1,118 +1,241 @@
-"""Everything made is found by what made it: a specification, its digest, a folder.
+"""Nodes, each told by what makes it, and the store that makes what is missing of them.
 
-    <store>/<kind>/<digest>/spec.json   beside whatever the artefact holds, log.txt among it where something was said
-    <store>/logs/<kind>-<digest>.txt    the same log while the artefact is in the making, and after a failure
-
-Whatever does not show in an artefact's bytes (labels, paths, numbers of workers) is no part of its specification.
+<store>/<kind>/<digest>/spec.json   beside whatever the node holds, log.txt among it where something was said
+<store>/logs/<kind>-<digest>.txt    the same log while the node is in the making, and after a failure
 """
 
 import json
 import logging
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
+from graphlib import TopologicalSorter
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, ClassVar, NotRequired, TypedDict
 
+from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.digests import digest
 from lerobot_constructskill.artifacts.folders import staged, sweep
 from lerobot_constructskill.artifacts.locks import locked
+from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.errors import InputError, MissingError, TakenError, full_traceback
 from lerobot_constructskill.files import Json, read_text
-
-
-class _Spec(TypedDict, total=False):
-    seed: int
-    training: dict[str, Any]
-
+from lerobot_constructskill.progress import Progress, quiet
 
 NOTED = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d$")
 """The line above an exception in a log."""
 
 LONGEST = 1 << 30
-"""Bytes of a log."""
+"""Largest size of a log, in bytes."""
 
 SPEC, LOG = "spec.json", "log.txt"
 
-SPECIFICATION = Json("the specification of what a store keeps", _Spec)
+INPUTS, VERSIONS, LINEAGE = "inputs", "versions", "lineage"
+"""Keys of a specification: digests of what the node is made of, its code, and specifications of all its ancestors."""
+
+
+class Spec(TypedDict):
+    inputs: NotRequired[dict[str, str]]
+    versions: dict[str, str]
+    lineage: NotRequired[dict[str, dict[str, Any]]]
+
+
+SPECIFICATION = Json("the specification of what a store keeps", Spec)
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Artifact:
-    """Something that can be made, and made again alike.
+class Machine:
+    """Where nodes are made and by how many processes. Nothing of it shows in what they hold.
 
     Args:
-        kind: the store's folder for such things, "demonstrations" for instance.
-        spec: plain values: all that its bytes depend on, with every default resolved.
+        workers: processes that generate demonstrations and simulate in rounds of DAgger.
+        simulators: processes that simulate evaluation episodes; one per core by default.
+        together: episodes of a round that run at the same time.
     """
 
-    kind: str
-    spec: Mapping[str, Any]
+    workers: int = 1
+    simulators: int | None = None
+    together: int = 8
+
+
+class Node:
+    """Something that can be made, and made again with the same bytes. Its subclasses are frozen dataclasses.
+
+    Two nodes are equal where their digests are. A digest holds all that the bytes depend on and nothing else: not
+    labels, paths or numbers of processes.
+    """
+
+    kind: ClassVar[str]
+    """The store's folder for such nodes."""
+    keeps: ClassVar[str | None] = None
+    """A folder of finished parts beside the node in the making, which outlives a kill."""
+    is_passing: ClassVar[bool] = False
+    """Whether the node is removed as soon as what was made of it is there."""
+    is_single_threaded: bool = False
+    """Whether `make` keeps one core busy, so that several nodes are made at the same time."""
+    parts: tuple["Node", ...] = ()
+    """The data sets that a merged data set consists of, in order."""
+
+    def facts(self) -> Mapping[str, Any]:
+        """The node's own settings: plain values, every default written out."""
+        raise NotImplementedError
+
+    def versions(self) -> Mapping[str, str]:
+        """The code that makes it, as it is now: package or room to version."""
+        raise NotImplementedError
+
+    @property
+    def inputs(self) -> Mapping[str, "Node"]:
+        """The nodes that it is made of, by the name of their role."""
+        return {}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Write the node to `folder`, a path that does not exist yet, from the folders of its inputs."""
+        raise NotImplementedError
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """All that the bytes depend on.
+
+        Raises:
+            InputError: the node is made of itself.
+        """
+        try:
+            made_of = {name: one.digest for name, one in self.inputs.items()}
+        except RecursionError:
+            raise InputError(f"One of the {self.kind} is made of itself.") from None
+        return {**self.facts(), **({INPUTS: made_of} if made_of else {}), VERSIONS: dict(self.versions())}
+
+    @cached_property
+    def lineage(self) -> dict[str, dict[str, Any]]:
+        """The specifications of all that it is made of, by digest."""
+        found, unseen = {}, [*self.inputs.values()]
+        while unseen:
+            one = unseen.pop()
+            if one.digest not in found:
+                found[one.digest] = one.spec
+                unseen += one.inputs.values()
+        return found
 
     @cached_property
     def digest(self) -> str:
         return digest(self.spec)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Node) and (self.kind, self.digest) == (other.kind, other.digest)
+
+    def __hash__(self) -> int:
+        return hash((self.kind, self.digest))
+
 
 @dataclass(frozen=True)
 class Store:
-    """A folder of artefacts, for all studies and for all machines that share it."""
+    """A folder of nodes, for all studies and for all machines that share it."""
 
     root: Path
 
-    def folder(self, artifact: Artifact) -> Path:
-        """Where an artefact is, or will be."""
-        return self.root / artifact.kind / artifact.digest
+    def get(self, node: Node, machine: Machine = Machine()) -> Path:  # noqa: B008  it is immutable
+        """The folder of a node. What is missing of it, and of what it is made of, is made.
 
-    def has(self, artifact: Artifact) -> bool:
-        """Whether it has been made.
+        Raises:
+            InputError: something else is in its place, or the node is made of itself.
+            MachineError: code was edited while it was at work, or the disk is full.
+            Exception: whatever making a node raises.
+        """
+        for one in dict.fromkeys([*self._due(node), node]):  # itself to be tidied up after a kill
+            with self.claim([one]) as missing, ExitStack() as stack:
+                stack.callback(self._discard_passing, one)
+                if missing:
+                    inputs = {name: self.get(other, machine) for name, other in one.inputs.items()}
+                    with self.writing(one) as folder:
+                        one.make(folder, inputs, machine)
+        return self.folder(node)
+
+    def _due(self, node: Node) -> list[Node]:
+        """What is missing for a node, in an order in which it can be made."""
+        made_of, unseen = {}, [node]
+        while unseen:
+            one = unseen.pop()
+            if one not in made_of and not self.has(one):
+                made_of[one] = list(one.inputs.values())
+                unseen += made_of[one]
+        return [one for one in TopologicalSorter(made_of).static_order() if one in made_of]
+
+    def get_all(self, nodes: Sequence[Node], machine: Machine) -> dict[Node, Exception]:
+        """Make what is missing of several nodes, and return why some could not be made; the others are made.
+
+        Nodes that keep one core busy are made at the same time, a process for each core.
+
+        Raises:
+            BrokenExecutor: a process died.
+        """
+        missing = [one for one in dict.fromkeys(nodes) if not self.has(one)]
+        beside = [one for one in missing if one.is_single_threaded]
+        if min(len(beside), cores()) < 2:
+            beside = []
+        failed = {one: error for one in missing if one not in beside and (error := self._try(one, machine))}
+        for one in beside:
+            for other in one.inputs.values():  # or each process would wait for the one that makes it
+                if error := self._try(other, machine):
+                    failed[one] = error
+        if beside := [one for one in beside if one not in failed]:
+            with (
+                open_pool("processes", min(len(beside), cores())) as submit,
+                Progress(total=len(beside), desc=beside[0].kind, unit="node") as bar,
+            ):
+                running = {one: submit(_get_quietly, self, one, machine) for one in beside}
+                for one, future in running.items():
+                    if error := _error_of(future):
+                        failed[one] = error
+                    bar.update()
+        return failed
+
+    def _try(self, node: Node, machine: Machine) -> Exception | None:
+        try:
+            self.get(node, machine)
+        except Exception as error:  # whatever a policy, its weights or its data set may raise
+            return error
+        return None
+
+    def folder(self, node: Node) -> Path:
+        """Where a node is, or will be."""
+        return self.root / node.kind / node.digest
+
+    def has(self, node: Node) -> bool:
+        """Whether a node has been made.
 
         Raises:
             InputError: something else is in its place.
         """
-        folder = self.folder(artifact)
+        folder = self.folder(node)
         if not folder.exists():
             return False
-        if _read_spec(folder / SPEC) != json.loads(json.dumps(artifact.spec)):
+        made = _read_spec(folder / SPEC) or {}
+        if {key: value for key, value in made.items() if key != LINEAGE} != json.loads(json.dumps(node.spec)):
             raise InputError(f"{folder} was not made by this version of the package: move it away.")
         return True
 
-    def spec(self, kind: str, name: str) -> Mapping[str, Any] | None:
-        """The specification of what has this digest; None where it has not been made."""
+    def spec(self, kind: str, name: str) -> Spec | None:
+        """The specification of the node with this digest, with its lineage; None where it has not been made."""
         return _read_spec(self.root / kind / name / SPEC)
 
-    def keeps(self, kind: str, name: str) -> bool:
-        """Whether something of this digest has been made, whatever its specification."""
-        return (self.root / kind / name).is_dir()
-
-    def obtain(self, artifact: Artifact, make: Callable[[Path], None], keep: str | None = None) -> Path:
-        """The folder of an artefact, which `make` writes to the path that it is given, where it is not there.
-
-        Args:
-            keep: as of `staged`.
-        """
-        with self.claim([artifact]) as missing:
-            for one in missing:
-                with self.writing(one, keep) as folder:
-                    make(folder)
-        return self.folder(artifact)
-
     @contextmanager
-    def claim(self, artifacts: Sequence[Artifact]) -> Iterator[list[Artifact]]:
-        """Wait until nobody else makes any of `artifacts`, and yield those that are still to be made."""
-        different = {(artifact.kind, artifact.digest): artifact for artifact in artifacts}
+    def claim(self, nodes: Sequence[Node]) -> Iterator[list[Node]]:
+        """Wait until no other process makes any of `nodes`, and yield those that are still to be made."""
+        different = sorted(dict.fromkeys(nodes), key=lambda node: (node.kind, node.digest))
         with ExitStack() as stack:
-            for kind, name in sorted(different):  # all in one order, or two processes would wait for each other
-                self._enter(stack, self.root / "locks" / f"{kind}-{name}")
-            missing = [artifact for artifact in different.values() if not self.has(artifact)]
-            for artifact in different.values():
-                self._tidy(artifact, artifact in missing)
+            for node in different:  # all in one order, or two processes would wait for each other
+                self._enter(stack, self.root / "locks" / f"{node.kind}-{node.digest}")
+            missing = [node for node in dict.fromkeys(nodes) if not self.has(node)]
+            for node in different:
+                self._tidy(node, node in missing)
             yield missing
 
     @staticmethod
@@ -124,49 +247,80 @@ class Store:
             stack.enter_context(locked(lock))
 
     @contextmanager
-    def writing(self, artifact: Artifact, keep: str | None = None) -> Iterator[Path]:
-        """Yield a path to write the artefact's folder to, as `staged` does; its specification and log are added."""
-        with staged(self.folder(artifact), keep) as folder:
+    def writing(self, node: Node) -> Iterator[Path]:
+        """Yield a path to write a claimed node's folder to, as `staged` does; specification and log are added.
+
+        Raises:
+            MachineError: the code that makes the node was edited since its digest was asked for.
+        """
+        with staged(self.folder(node), node.keeps) as folder:
             yield folder
-            log = self.log(artifact)
+            check_unedited(node.spec[VERSIONS], node.versions())
+            log = self.log(node)
             if log.exists():
                 shutil.copy(log, folder / LOG)
-            (folder / SPEC).write_text(json.dumps(artifact.spec, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+            spec = node.spec | ({LINEAGE: node.lineage} if node.lineage else {})
+            (folder / SPEC).write_text(json.dumps(spec, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         log.unlink(missing_ok=True)
 
-    def log(self, artifact: Artifact) -> Path:
-        """What was said while the artefact was made; in its own folder once it is there."""
-        return self.root / "logs" / f"{artifact.kind}-{artifact.digest}.txt"
+    def log(self, node: Node) -> Path:
+        """What was said while the node was made; in its own folder once it is there."""
+        return self.root / "logs" / f"{node.kind}-{node.digest}.txt"
 
-    def notes(self, artifact: Artifact) -> int:
+    def notes(self, node: Node) -> int:
         """How many exceptions its log holds while it is not made."""
-        log = self.log(artifact)
+        log = self.log(node)
         return sum(map(bool, map(NOTED.match, read_text(log, LONGEST).splitlines()))) if log.exists() else 0
 
-    def note(self, artifact: Artifact, error: BaseException) -> None:
+    def note(self, node: Node, error: BaseException) -> None:
         """Add an exception's whole traceback to the log."""
-        log = self.log(artifact)
+        log = self.log(node)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{full_traceback(error)}\n")
 
-    def discard(self, artifact: Artifact) -> None:
-        """Remove an artefact that the caller has claimed, so that it is made anew."""
-        self.folder(artifact).rename(self._doomed(artifact))  # at once, where removing takes its time
-        shutil.rmtree(self._doomed(artifact), ignore_errors=True)
+    def discard(self, node: Node) -> None:
+        """Remove a node that the caller has claimed, so that it is made anew."""
+        if self.folder(node).exists():
+            self.folder(node).rename(self._doomed(node))  # at once, where removing takes its time
+        shutil.rmtree(self._doomed(node), ignore_errors=True)
 
-    def _tidy(self, artifact: Artifact, is_missing: bool) -> None:
-        """Remove what a process left that was killed when the artefact was whole, or gone, already."""
-        shutil.rmtree(self._doomed(artifact), ignore_errors=True)
+    def _discard_passing(self, node: Node) -> None:
+        """Remove what a node was made of, where it is not to stay."""
+        for one in node.inputs.values():
+            if one.is_passing:
+                with self.claim([one]):
+                    self.discard(one)
+
+    def _tidy(self, node: Node, is_missing: bool) -> None:
+        """Remove what a process left that was killed when the node was whole, or gone, already."""
+        shutil.rmtree(self._doomed(node), ignore_errors=True)
         if not is_missing:
-            sweep(self.folder(artifact))
-            self.log(artifact).unlink(missing_ok=True)
+            self._discard_passing(node)
+            sweep(self.folder(node))
+            self.log(node).unlink(missing_ok=True)
 
-    def _doomed(self, artifact: Artifact) -> Path:
-        return self.root / artifact.kind / f".{artifact.digest}.discarded"
+    def _doomed(self, node: Node) -> Path:
+        return self.root / node.kind / f".{node.digest}.discarded"
 
 
-def _read_spec(path: Path) -> Any:
+def _get_quietly(store: Store, node: Node, machine: Machine) -> None:
+    """In a process of its own, whose bars would mix with those of the others."""
+    with quiet():
+        store.get(node, machine)
+
+
+def _error_of(future: Future) -> Exception | None:
+    try:
+        future.result()
+    except BrokenExecutor:
+        raise
+    except Exception as error:
+        return error
+    return None
+
+
+def _read_spec(path: Path) -> Spec | None:
     try:
         return SPECIFICATION.read(path)
     except (MissingError, InputError):

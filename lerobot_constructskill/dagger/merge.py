@@ -1,59 +1,87 @@
-"""Demonstrations and rounds into one LeRobotDataset, which says of every frame who acted, and of itself who drove."""
+"""Demonstrations and rounds as one LeRobotDataset, which says of every frame who acted, and of itself who drove."""
 
 import json
 import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset, modify_features
 
-from lerobot_constructskill.artifacts.digests import file_sha256
+from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
-from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.dagger.plan import Plan
-from lerobot_constructskill.dagger.rounds import obtain_round, totals
+from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.dagger.rounds import DRIVEN, DRIVING, OUTCOMES, Round, totals
 from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
 from lerobot_constructskill.demos.modality import write_meanings
-from lerobot_constructskill.demos.obtain import obtain_demonstrations
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.progress import quiet
 
 
-def parts_of(plan: Plan, number: int, store: Store) -> list[LeRobotDataset]:
-    """The demonstrations and the first `number` rounds, each made if it is not there."""
-    rounds = [obtain_round(plan, past, store)[0] for past in range(1, number + 1)]
-    return [obtain_demonstrations(plan.base, store), *rounds]
+@dataclass(frozen=True, eq=False)
+class MergedSet(Node):
+    """Demonstrations and the rounds that follow them."""
 
+    base: Demonstrations
+    rounds: tuple[Round, ...]
 
-def obtain_data(plan: Plan, number: int, store: Store) -> LeRobotDataset:
-    """What policy `number` is trained on."""
-    parts = parts_of(plan, number, store)
-    if number == 0:
-        return parts[0]
-    made = plan.data(number)
-    repo_id = f"local/{made.digest}"
-    return LeRobotDataset(repo_id, root=store.obtain(made, lambda folder: _merge(plan, parts, repo_id, folder, store)))
+    kind = "dagger"
 
+    @property
+    def parts(self) -> tuple[Node, ...]:
+        return self.base, *self.rounds
 
-def _merge(plan: Plan, parts: list[LeRobotDataset], repo_id: str, folder: Path, store: Store) -> None:
-    base, *rounds = parts
-    # The disk's room is measured before the scratch folder is gone.
-    with quiet(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):
-        first = Path(scratch) / "demonstrations"
-        _add_columns(plan, base, first)
-        aggregate(repo_id, [first, *(part.root for part in rounds)], folder, Path(scratch))
-    write_statistics(folder)
-    write_meanings(folder, plan.task, plan.base.obs_type)
-    facts = MADE.read(base.root / SIDECAR)
-    facts["dagger"] = {
-        "policy": plan.checkpoint(0).spec["policy"],
-        "training_seed": plan.config.seed,
-        "demonstrations": base.num_episodes,
-        "rounds": [_provenance(plan, number, store) for number in range(1, len(parts))],
-    }
-    write_sidecar(folder, facts)
+    def facts(self) -> dict[str, Any]:
+        return {}
+
+    def versions(self) -> dict[str, str]:
+        return versions(*DRIVING) | code_of(__name__)
+
+    @cached_property
+    def inputs(self) -> dict[str, Node]:
+        driven = {f"round_{one.number}": one for one in self.rounds}
+        return {"demonstrations": self.base, **driven}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Merge the parts and say in the sidecar who drove."""
+        config, repo_id = self.base.config, f"local/{self.digest}"
+        base = LeRobotDataset(f"local/{self.base.digest}", root=inputs["demonstrations"])
+        driven = [inputs[f"round_{one.number}"] for one in self.rounds]
+        # The disk's room is measured before the scratch folder is gone.
+        with quiet(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):
+            first = Path(scratch) / "demonstrations"
+            self._add_columns(base, first)
+            aggregate(repo_id, [first, *driven], folder, Path(scratch))
+        write_statistics(folder)
+        write_meanings(folder, get_task(config.task), config.obs_type)
+        facts = MADE.read(base.root / SIDECAR)
+        facts["dagger"] = {
+            "policy": self.rounds[0].policy.learner.facts(),
+            "training_seed": self.rounds[0].policy.seeds.start,
+            "demonstrations": base.num_episodes,
+            "rounds": [_provenance(one, root) for one, root in zip(self.rounds, driven, strict=True)],
+        }
+        write_sidecar(folder, facts)
+
+    def _add_columns(self, base: LeRobotDataset, folder: Path) -> None:
+        task, obs_type = get_task(self.base.config.task), self.base.config.obs_type
+        columns, frames = dagger_features(task, obs_type), base.num_frames
+        values = {
+            "dagger.round": np.zeros((frames, 1), dtype=np.int64),
+            "dagger.actor": np.full((frames, 1), EXPERT, dtype=object),
+            "dagger.hopeless": np.zeros((frames, 1), dtype=bool),
+        }
+        added = columns.keys() - demonstration_features(task, obs_type).keys()
+        modify_features(
+            base, {name: (values[name], columns[name]) for name in sorted(added)}, None, folder, base.repo_id
+        )
 
 
 def write_sidecar(folder: Path, facts: dict[str, Any]) -> None:
@@ -63,27 +91,14 @@ def write_sidecar(folder: Path, facts: dict[str, Any]) -> None:
     )
 
 
-def _add_columns(plan: Plan, base: LeRobotDataset, folder: Path) -> None:
-    columns, frames = dagger_features(plan.task, plan.base.obs_type), base.num_frames
-    values = {
-        "dagger.round": np.zeros((frames, 1), dtype=np.int64),
-        "dagger.actor": np.full((frames, 1), EXPERT, dtype=object),
-        "dagger.hopeless": np.zeros((frames, 1), dtype=bool),
-    }
-    added = columns.keys() - demonstration_features(plan.task, plan.base.obs_type).keys()
-    modify_features(base, {name: (values[name], columns[name]) for name in sorted(added)}, None, folder, base.repo_id)
-
-
-def _provenance(plan: Plan, number: int, store: Store) -> dict[str, Any]:
+def _provenance(driven: Round, root: Path) -> dict[str, Any]:
     """Who drove in a round, and how."""
-    _, outcomes = obtain_round(plan, number, store)
-    weights = store.folder(plan.checkpoint(number - 1)) / "model.safetensors"
     return {
-        "round": number,
-        "beta": plan.config.beta(number),
-        "policy_sha256": file_sha256(weights) if weights.exists() else None,
-        "checkpoint": plan.checkpoint(number - 1).digest,
-        "seed_start": plan.seeds(number).start,
-        "patience": plan.config.patience,
-        **totals(outcomes),
+        "round": driven.number,
+        "beta": driven.beta,
+        "policy_sha256": DRIVEN.read(root / OUTCOMES).policy_sha256,
+        "checkpoint": driven.policy.digest,
+        "seed_start": driven.seeds.start,
+        "patience": driven.patience,
+        **totals(root),
     }

@@ -1,129 +1,113 @@
-"""A DAgger run before anything runs: every policy, round and data set of it, each found by what makes it."""
+"""A DAgger run before anything runs: every policy, round and data set of it, as nodes that are made of each other."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
-
-from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.store import Artifact
-from lerobot_constructskill.contract import Task, get_task
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.dagger.merge import MergedSet
+from lerobot_constructskill.dagger.rounds import Evaluation, Round
 from lerobot_constructskill.dagger.settings import DaggerConfig
-from lerobot_constructskill.demos.obtain import artifact
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
 from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse_named
-from lerobot_constructskill.training.checkpoints import ACTING, check_inputs, checkpoint_artifact, settle_policy
-from lerobot_constructskill.training.trainers import versions_of
-
-DRIVING = (*ACTING, "av")
-"""Packages whose versions may show in a round's frames, beside the policy's own."""
+from lerobot_constructskill.training.checkpoints import Checkpoints, check_inputs
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import Learner
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Plan:
-    """What a configuration asks for. Policy 0 learns from the demonstrations, policy k from those of k rounds too.
+    """Policy 0 learns from the demonstrations, policy k from those and k rounds, in each of which the last one drove.
+
+    Args:
+        config: the rounds and evaluations. Its base, policy, training and seed are not read.
+        base: the demonstrations to begin with.
+        learner: what is trained.
+        training: how.
+        seed: the training seed.
 
     Raises:
-        InputError: the base cannot be read, its labels are not the expert's, a start would be used twice, nothing can
-            be a policy, or the policy is to drive and reads what the base does not show.
+        InputError: the base's labels are not the expert's, or a start would be used twice.
     """
 
     config: DaggerConfig
+    base: Demonstrations
+    learner: Learner
+    training: Training
+    seed: int
 
-    @cached_property
-    def base(self) -> GenerateConfig:
-        flags = ["--repo_id=local/any", f"--workers={self.config.workers}", "--labels=advice"]
-        base = parse_named(GenerateConfig, "generate", self.config.base, flags)
-        if base.labels == "executed":
-            raise InputError(
-                f"The base '{self.config.base}' has executed actions as labels; DAgger needs the expert's."
-            )
-        check_apart({"demonstrations": base.starts, "rounds": self.config.starts, "evaluation": self.eval_seeds})
-        return base
+    def __post_init__(self):
+        if self.base.config.labels == "executed":
+            raise InputError("The base has executed actions as labels; DAgger needs the expert's.")
+        starts = {"demonstrations": self.base.starts, "rounds": self.config.starts}
+        check_apart(starts | {"evaluation": self.config.eval_starts})
 
-    @cached_property
-    def policy(self) -> PreTrainedConfig:
-        return settle_policy(self.config.policy)
+    @classmethod
+    def of(cls, config: DaggerConfig) -> "Plan":
+        """The plan of a whole configuration.
 
-    @property
-    def task(self) -> Task:
-        return get_task(self.base.task)
+        Raises:
+            InputError: the base cannot be read, or nothing can be a policy.
+        """
+        base = parse_named(GenerateConfig, "generate", config.base, ["--repo_id=local/any", "--labels=advice"])
+        return cls(config, Demonstrations(base), Learner.of(config.policy), config.training, config.seed)
 
     @cached_property
     def env(self) -> dict[str, Any]:
-        """Keywords of `ConstructSkillEnv` in every round, what they leave to the machine written out."""
-        check_inputs(self.policy, self.base.obs_type)
-        light_robot, backend = resolve_rendering(self.base.light_robot)
-        length = self.config.max_steps or self.task.horizon
+        """Keywords of `ConstructSkillEnv` in every round, with what they leave to the machine written out.
+
+        Raises:
+            InputError: the policy reads what the base does not show.
+        """
+        base = self.base.config
+        check_inputs(self.learner.config, base.obs_type)
+        light_robot, backend = resolve_rendering(base.light_robot)
         return {
-            "task": self.base.task,
-            "obs_type": self.base.obs_type,
-            "episode_length": length,
+            "task": base.task,
+            "obs_type": base.obs_type,
+            "episode_length": self.config.max_steps or get_task(base.task).horizon,
             "light_robot": light_robot,
             "render_backend": backend,
         }
 
-    @cached_property
-    def demonstrations(self) -> Artifact:
-        return artifact(self.base)
-
-    def data(self, number: int) -> Artifact:
-        """The demonstrations and the first `number` rounds."""
+    def data(self, number: int) -> Demonstrations | MergedSet:
+        """What policy `number` is trained on: the demonstrations and the first `number` rounds."""
         return self._chain[0][number]
 
-    def checkpoint(self, number: int) -> Artifact:
+    def checkpoint(self, number: int) -> Checkpoints:
         """Policy `number`."""
         return self._chain[1][number]
 
-    def round(self, number: int) -> Artifact:
+    def round(self, number: int) -> Round:
         """The frames of a round, counted from 1, in which policy `number - 1` drives."""
         return self._chain[2][number - 1]
 
     @cached_property
-    def _chain(self) -> tuple[list[Artifact], list[Artifact], list[Artifact]]:
-        """Data sets, policies and rounds in order, each found by those before it."""
-        data, policies, rounds = [self.demonstrations], [], []
+    def _chain(self) -> tuple[list[Demonstrations | MergedSet], list[Checkpoints], list[Round]]:
+        """Data sets, policies and rounds in order."""
+        data, policies, rounds = [self.base], [self._trained_on(self.base)], []
         for number in range(1, self.config.rounds + 1):
-            policies.append(self._trained_on(data[-1]))
             rounds.append(self._driven_by(policies[-1], number))
-            digests = [driven.digest for driven in rounds]
-            data.append(Artifact("dagger", {"demonstrations": self.demonstrations.digest, "rounds": digests}))
-        return data, [*policies, self._trained_on(data[-1])], rounds
+            data.append(MergedSet(self.base, tuple(rounds)))
+            policies.append(self._trained_on(data[-1]))
+            assert policies[-1].digest  # now, where few calls are nested: a hundred rounds would be too many
+        return data, policies, rounds
 
-    def _trained_on(self, data: Artifact) -> Artifact:
-        return checkpoint_artifact(self.policy, self.config.training, self.config.seed, data.spec, stack=1)
+    def _trained_on(self, data: Demonstrations | MergedSet) -> Checkpoints:
+        return Checkpoints.holding(self.seed, self.learner, self.training, data, alone=True)
 
-    def _driven_by(self, policy: Artifact, number: int) -> Artifact:
-        facts = {
-            "number": number,
-            "learner": policy.digest,
-            "beta": self.config.beta(number),
-            "seeds": [self.seeds(number).start, self.config.episodes],
-            "expert": vars(self.base.expert),
-            "environment": self.env,
-            "patience": self.config.patience,
-        }
-        return Artifact("rounds", facts | {"versions": self._versions})
+    def _driven_by(self, policy: Checkpoints, number: int) -> Round:
+        seeds, config = self.seeds(number), self.config
+        return Round(policy, self.base, self.env, seeds, number, config.beta(number), config.patience)
 
-    def evaluation(self, number: int) -> Artifact:
+    def evaluation(self, number: int) -> Evaluation:
         """How policy `number` does by itself."""
-        seeds = [self.config.eval_seed, self.config.eval_episodes]
-        facts = {"learner": self.checkpoint(number).digest, "seeds": seeds, "environment": self.env}
-        return Artifact("evaluations", facts | {"versions": self._versions})
+        return Evaluation(self.checkpoint(number), self.base, self.env, self.config.eval_starts)
 
     def seeds(self, number: int) -> range:
-        """Those of a round."""
+        """Seeds of the episodes of a round."""
         first = (number - 1) * self.config.episodes
         return self.config.starts[first : first + self.config.episodes]
-
-    @property
-    def eval_seeds(self) -> range:
-        return range(self.config.eval_seed, self.config.eval_seed + self.config.eval_episodes)
-
-    @cached_property
-    def _versions(self) -> dict[str, str]:
-        return versions(*DRIVING) | code_of(__name__, self.task.scene, self.task.expert) | versions_of(self.policy)

@@ -1,28 +1,33 @@
-"""A round into a LeRobotDataset: an episode, a shard; what a killed run finished is not driven again."""
+"""Episodes that a policy drives, as nodes: a round, which is a LeRobotDataset, and an evaluation."""
 
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from lerobot.datasets import LeRobotDataset
-
+from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.digests import file_sha256, versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.wheel import Drive, Episode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.merge import aggregate
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.shards import EPISODE, whole, write_episode
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.progress import quiet
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.training.trainers import trainer_of
+from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of
+
+DRIVING = (*ACTING, "av")
+"""Packages whose versions may show in a round's frames, beside the policy's own."""
 
 SHARDS = "shards"
 OUTCOME, OUTCOMES = "outcome.json", "outcomes.json"
@@ -50,76 +55,133 @@ class DrivenEpisode:
         return cls(episode.seed, episode.placed, len(episode.frames), by_expert)
 
 
-DRIVEN = Json("a round's episodes", list[DrivenEpisode])
+@dataclass(frozen=True)
+class Driven:
+    """What is kept of all episodes that a policy drove.
 
-
-def obtain_round(plan: Plan, number: int, store: Store) -> tuple[LeRobotDataset, list[DrivenEpisode]]:
-    """A round's frames and outcomes, in the order of its seeds; driven if they are not there.
-
-    Raises:
-        InputError: no episode of it has a frame.
-        OSError: the disk is full, this machine cannot render, or a simulator died.
+    Args:
+        policy_sha256: hash of the policy's weights; None where they are in no `model.safetensors`.
+        episodes: in the order of their seeds.
     """
-    made = plan.round(number)
-    repo_id = f"local/{made.digest}"
-    folder = store.obtain(made, lambda folder: _write_round(plan, number, repo_id, folder, store), keep=SHARDS)
-    return LeRobotDataset(repo_id, root=folder), DRIVEN.read(folder / OUTCOMES)
+
+    policy_sha256: str | None
+    episodes: list[DrivenEpisode]
 
 
-def obtain_evaluation(plan: Plan, number: int, store: Store) -> list[DrivenEpisode]:
-    """How policy `number` does in every evaluation episode by itself."""
+ONE, DRIVEN = Json("a driven episode", DrivenEpisode), Json("a round's episodes", Driven)
 
-    def make(folder: Path) -> None:
-        never = plan.env["episode_length"] + 1  # nobody gives up for it
-        alone = Drive(number, beta=0.0, patience=never, pictures=False)
-        outcomes = [DrivenEpisode.of(episode) for episode in _drive(plan, number, plan.eval_seeds, alone, store)]
+
+@dataclass(frozen=True, eq=False)
+class Evaluation(Node):
+    """Episodes in which a policy acts by itself.
+
+    Args:
+        policy: one checkpoint.
+        base: the demonstrations, for their task and their expert.
+        env: keywords of `ConstructSkillEnv`.
+        seeds: of the initial states.
+    """
+
+    policy: Checkpoints
+    base: Demonstrations
+    env: Mapping[str, Any]
+    seeds: range
+
+    kind = "evaluations"
+
+    def facts(self) -> dict[str, Any]:
+        return {"seeds": [self.seeds.start, self.seeds.stop], "environment": self.env}
+
+    def versions(self) -> dict[str, str]:
+        task = get_task(self.base.config.task)
+        own = code_of(__name__, task.scene, task.expert)
+        return versions(*DRIVING) | own | self.policy.learner.versions()
+
+    @cached_property
+    def inputs(self) -> dict[str, Node]:
+        return {"policy": self.policy}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Drive every episode to its end.
+
+        Raises:
+            MachineError: this machine cannot render, or a simulator died.
+        """
+        never = self.env["episode_length"] + 1
+        alone = Drive(0, beta=0.0, patience=never, pictures=False)
+        outcomes = [DrivenEpisode.of(episode) for episode in self._drive(self.seeds, alone, inputs, machine)]
         folder.mkdir()
-        _save(sorted(outcomes, key=lambda outcome: outcome.seed), folder / OUTCOMES)
+        self._save(sorted(outcomes, key=lambda outcome: outcome.seed), inputs, folder)
 
-    return DRIVEN.read(store.obtain(plan.evaluation(number), make) / OUTCOMES)
+    def _checkpoint(self, inputs: Mapping[str, Path]) -> Path:
+        (seed,) = self.policy.seeds
+        return checkpoint_of(seed, inputs["policy"])
 
+    def _save(self, outcomes: list[DrivenEpisode], inputs: Mapping[str, Path], folder: Path) -> None:
+        weights = self._checkpoint(inputs) / "model.safetensors"
+        driven = Driven(file_sha256(weights) if weights.exists() else None, outcomes)
+        (folder / OUTCOMES).write_text(json.dumps(asdict(driven)) + "\n", encoding="utf-8")
 
-def _write_round(plan: Plan, number: int, repo_id: str, folder: Path, store: Store) -> None:
-    shards = folder.with_name(SHARDS)
-    finished = {outcome.seed for outcome in whole(shards, OUTCOME, _read_one)}
-    seeds = [seed for seed in plan.seeds(number) if seed not in finished]
-    features = dagger_features(plan.task, plan.base.obs_type)
-    drive = Drive(number, plan.config.beta(number), plan.config.patience)
-    for episode in _drive(plan, number - 1, seeds, drive, store):
-        with staged(shards / str(episode.seed)) as shard:
-            shard.mkdir()
-            if episode.frames:
-                write_episode(repo_id, plan.task, features, episode.frames, shard / EPISODE, plan.base.video)
-            _save([DrivenEpisode.of(episode)], shard / OUTCOME)
-    outcomes = [outcome for seed in plan.seeds(number) for outcome in DRIVEN.read(shards / str(seed) / OUTCOME)]
-    roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
-    if not roots:
-        raise InputError(f"Round {number} has no frame in which the expert knew a way to success.")
-    with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
-        aggregate(repo_id, roots, folder, Path(scratch))
-    _save(outcomes, folder / OUTCOMES)
+    def _drive(
+        self, seeds: Iterable[int], drive: Drive, inputs: Mapping[str, Path], machine: Machine
+    ) -> Iterator[Episode]:
+        agent = PolicyAgent.from_pretrained(self._checkpoint(inputs), **self.policy.learner.acting)
+        expert = make_expert(get_task(self.base.config.task), self.base.config.expert)
+        yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
 
 
-def _drive(plan: Plan, policy: int, seeds: Iterable[int], drive: Drive, store: Store) -> Iterator[Episode]:
-    here = {name: getattr(plan.policy, name) for name in trainer_of(plan.policy).places}
-    checkpoint = store.folder(plan.checkpoint(policy))
-    learner = PolicyAgent.from_pretrained(checkpoint, plan.policy.device, **here)
-    expert = make_expert(plan.task, plan.base.expert)
-    yield from drive_all(learner, expert, plan.env, seeds, drive, plan.config.together, plan.config.workers)
+@dataclass(frozen=True, eq=False)
+class Round(Evaluation):
+    """Episodes in which a policy drives and the expert labels every frame; a LeRobotDataset.
+
+    Args:
+        number: of the round, counted from 1.
+        beta: probability that a step executes the expert's action.
+        patience: hopeless steps in a row after which an episode ends.
+    """
+
+    number: int
+    beta: float
+    patience: int
+
+    kind = "rounds"
+    keeps = SHARDS
+
+    def facts(self) -> dict[str, Any]:
+        how = {"number": self.number, "beta": self.beta, "patience": self.patience}
+        return super().facts() | how | {"expert": vars(self.base.config.expert), "video": self.base.config.video}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Drive the round: an episode, a shard. Shards that a killed run finished are not driven again.
+
+        Raises:
+            InputError: no episode has a frame.
+            MachineError: the disk is full, this machine cannot render, or a simulator died.
+        """
+        shards, config = folder.with_name(SHARDS), self.base.config
+        task, repo_id = get_task(config.task), f"local/{self.digest}"
+        finished = {outcome.seed for outcome in whole(shards, OUTCOME, ONE.read)}
+        drive = Drive(self.number, self.beta, self.patience)
+        for episode in self._drive([seed for seed in self.seeds if seed not in finished], drive, inputs, machine):
+            with staged(shards / str(episode.seed)) as shard:
+                shard.mkdir()
+                if episode.frames:
+                    features = dagger_features(task, config.obs_type)
+                    write_episode(repo_id, task, features, episode.frames, shard / EPISODE, config.video)
+                outcome = json.dumps(asdict(DrivenEpisode.of(episode)))
+                (shard / OUTCOME).write_text(outcome + "\n", encoding="utf-8")
+        outcomes = [ONE.read(shards / str(seed) / OUTCOME) for seed in self.seeds]
+        roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
+        if not roots:
+            raise InputError(f"Round {self.number} has no frame in which the expert knew a way to success.")
+        with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
+            aggregate(repo_id, roots, folder, Path(scratch))
+        self._save(outcomes, inputs, folder)
 
 
-def _save(outcomes: Iterable[DrivenEpisode], path: Path) -> None:
-    path.write_text(json.dumps([asdict(outcome) for outcome in outcomes]) + "\n", encoding="utf-8")
-
-
-def _read_one(path: Path) -> DrivenEpisode:
-    (outcome,) = DRIVEN.read(path)
-    return outcome
-
-
-def totals(outcomes: Iterable[DrivenEpisode]) -> Mapping[str, Any]:
-    """What a line, and the provenance, say of a round's outcomes."""
-    outcomes = list(outcomes)
+def totals(folder: Path) -> dict[str, Any]:
+    """Sums over the episodes of a round or an evaluation, and the seeds of those without a frame."""
+    outcomes = DRIVEN.read(folder / OUTCOMES).episodes
     return {
         "episodes": len(outcomes),
         "placed": sum(outcome.placed for outcome in outcomes),

@@ -72,6 +72,11 @@ class DaggerConfig:
         """Seeds of the episodes of all rounds."""
         return range(self.seed_start, self.seed_start + self.rounds * self.episodes)
 
+    @property
+    def eval_starts(self) -> range:
+        """Seeds of the evaluation episodes."""
+        return range(self.eval_seed, self.eval_seed + self.eval_episodes)
+
     def beta(self, number: int) -> float:
         """That of a round, counted from 1."""
         return self.betas[min(number, len(self.betas)) - 1]

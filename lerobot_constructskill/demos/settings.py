@@ -108,14 +108,13 @@ def frames_digest(config: GenerateConfig) -> str:
     facts = generator_facts(config)
     for name in ("repo_id", "episodes", "max_failures", "seed_start"):
         del facts[name]
-    return digest(facts | code_facts(config))
+    return digest(facts | frame_facts(config) | {"versions": frame_versions(config.task)})
 
 
-def code_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What a data set depends on beside its settings: encoder, columns, versions and revisions."""
+def frame_facts(config: GenerateConfig) -> dict[str, Any]:
+    """What a data set depends on beside its settings: the encoder's options and the columns."""
     columns = demonstration_features(get_task(config.task), config.obs_type)
-    made_by = frame_versions(config.task)
-    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns), "versions": made_by}
+    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)}
 
 
 def frame_versions(task: str) -> dict[str, str]:

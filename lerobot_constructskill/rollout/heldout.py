@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,14 +18,17 @@ FRAMES, BATCH = 512, 32
 """How many frames are looked at, at most, and how many at a time."""
 
 
-def heldout_mse(
-    checkpoint: Path, device: str | None, dataset: LeRobotDataset, episodes: Sequence[int]
-) -> float | None:
+def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[int], **acting: Any) -> float | None:
     """Mean squared translation error of a checkpoint on some demonstrations, in m2 (of one axis); None without any.
 
     It is over all steps of the chunks that the policy predicts from single frames, up to a demonstration's end, or
-    over its first actions where it predicts no chunks. Of many frames, `FRAMES` are looked at, evenly spaced. What a
-    policy samples is drawn from a fixed seed.
+    over its first actions where it predicts no chunks. Of many frames with pictures, `FRAMES` are looked at, evenly
+    spaced. What a policy samples is drawn from a fixed seed.
+
+    Args:
+        dataset: demonstrations, or the features of demonstrations that the policy was trained on.
+        episodes: numbers of the held-out episodes.
+        acting: fields of the policy's configuration in place of its own, as of `PolicyAgent.from_pretrained`.
 
     Raises:
         InputError: the policy acts in other actions, reads what the demonstrations lack, or makes its chunks from a
@@ -34,9 +38,9 @@ def heldout_mse(
     if not ends:
         return None
     frames = [*ends]
-    if len(frames) > FRAMES:
+    if dataset.meta.camera_keys and len(frames) > FRAMES:
         frames = [frames[number] for number in np.linspace(0, len(frames) - 1, FRAMES).astype(int)]
-    agent = PolicyAgent.from_pretrained(checkpoint, device)
+    agent = PolicyAgent.from_pretrained(checkpoint, **acting)
     check_actions(agent.policy, dataset)
     view = Subset(observed(dataset, agent.policy), frames)
     on_gpu = [agent.policy.config.device] if agent.policy.config.device.startswith("cuda") else []

@@ -16,11 +16,10 @@ def dagger(config: DaggerConfig) -> str:
         OSError: the disk is full, this machine cannot render, or a process died.
     """
     from lerobot_constructskill.artifacts.store import Store
-    from lerobot_constructskill.dagger.plan import Plan
     from lerobot_constructskill.dagger.run import run_dagger
 
     root = Path(config.root) if config.root else Path("outputs/dagger") / config.repo_id.split("/")[1]
-    lines = run_dagger(Plan(config), Store(config.store.absolute()), root.absolute(), say)
+    lines = run_dagger(config, Store(config.store.absolute()), root.absolute(), say)
     size = f"{plural(config.rounds, 'round')}, {plural(lines[-1].frames, 'frame')}"
     return f"{size}: {root}/dataset, {root}/checkpoint"
 

@@ -57,8 +57,8 @@ def study(config: StudyConfig) -> str:
     """
     from lerobot_constructskill.artifacts.store import LOG, Store
     from lerobot_constructskill.lerobot_internals import load_plugins
-    from lerobot_constructskill.study.run import choose, run_study
-    from lerobot_constructskill.study.runs import list_runs
+    from lerobot_constructskill.study.plan import list_runs
+    from lerobot_constructskill.study.session import choose, run_study
     from lerobot_constructskill.study.status import status
     from lerobot_constructskill.study.table import Table
 
@@ -72,7 +72,7 @@ def study(config: StudyConfig) -> str:
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
-        why, log = table.episodes(failed[0])[0].error, store.folder(failed[0].artifact) / LOG
+        why, log = table.episodes(failed[0])[0].error, store.folder(failed[0]) / LOG
         raise InputError(f"No run succeeded; the first of {made} failed with: {why} (log: {log})")
     lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
     left = f", {len(missing)} missing" if missing else ""

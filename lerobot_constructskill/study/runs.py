@@ -1,81 +1,65 @@
-"""From a study to its runs: all that a run depends on is read, checked and written out before anything runs."""
+"""Runs, the unit of a study: seeds of a variant are trained, evaluated in lockstep, and each is kept as a node.
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+<store>/runs/<digest>/  spec.json  checkpoint (a link)  episodes.parquet  recordings.parquet (what was executed)
+                        video.mp4 (of seed 0)  log.txt (if it failed)
+"""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig
+import httpx
+import torch
+from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.store import Artifact
+from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256, versions
+from lerobot_constructskill.artifacts.processor import processor
+from lerobot_constructskill.artifacts.store import Machine, Node, Store
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
-from lerobot_constructskill.demos.obtain import artifact
-from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
-from lerobot_constructskill.envs.gym_env import resolve_rendering
-from lerobot_constructskill.errors import InputError, UserError
-from lerobot_constructskill.parsing import decode, parse_named
-from lerobot_constructskill.policy_types import decode_policy
-from lerobot_constructskill.rollout.references import REFERENCES, Reference
-from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
-from lerobot_constructskill.study.spec import SHARED, Study, Variant
-from lerobot_constructskill.training.checkpoints import (
-    ACTING,
-    check_inputs,
-    checkpoint_artifact,
-    settle_policy,
-    settled_elsewhere,
-)
+from lerobot_constructskill.demos.node import Demonstrations
+from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
+from lerobot_constructskill.errors import MachineError, TakenError, kind_of
+from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
+from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
+from lerobot_constructskill.rollout.references import REFERENCES
+from lerobot_constructskill.rollout.video import FirstEpisode
+from lerobot_constructskill.study.rows import EpisodeRow, write_rows
+from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
+from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of, made_of
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import trainer_of, versions_of
+from lerobot_constructskill.training.trainers import OF_THE_MACHINE, Learner
 
-OURS = "constructskill"
-"""The one environment that a study evaluates in."""
+EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
-MAKES_RUNS, MEASURES_ERRORS = "lerobot_constructskill.study.execute", "lerobot_constructskill.rollout.heldout"
-"""Modules whose rooms show in a run's episodes, and in held-out errors."""
+FILMED_SEED = 0
 
-SEEDS_APART = 2_000
-"""From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
+TRIES = 3
+"""Times that the machine may fail a run before that is the run's result."""
+
+ERRNOS = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
+"""What an `OSError` says of the machine, its disks and its network."""
 
 
-@dataclass(frozen=True)
-class Demonstrations:
-    """A data set that a study names.
+@dataclass(frozen=True, eq=False)
+class DataSet:
+    """Demonstrations that a study names.
 
     Args:
-        name: what it is called.
-        config: what it is generated from.
-        moved: by how much its attempts' seeds are moved: 0 but for a training seed's own draw.
+        name: what they are called.
+        node: what they are made as.
+        moved: by how much the seeds of their attempts are moved: 0 but for a training seed's own draw.
     """
 
     name: str
-    config: GenerateConfig
+    node: Demonstrations
     moved: int = 0
-
-    @cached_property
-    def artifact(self) -> Artifact:
-        return artifact(self.config)
-
-    def drawn_for(self, seed: int) -> "Demonstrations":
-        """A training seed's own draw of it; that of seed 0 is what all seeds would share.
-
-        Raises:
-            InputError: two of them could have attempts in common.
-        """
-        attempts = self.config.episodes * (1 + self.config.max_failures)
-        if attempts > SEEDS_APART:
-            raise InputError(
-                f"{self.name} may take {attempts:,.0f} attempts; of demonstrations that each training seed has of its "
-                f"own, none may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
-            )
-        moved = seed * SEEDS_APART
-        return replace(self, config=replace(self.config, seed_start=self.config.seed_start + moved), moved=moved)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +72,9 @@ class Arm:
         evaluation: `seed` of the first episode, and how many `episodes`.
         demonstrations: what it learns from or replays, if it does.
         validated_on: all demonstrations of its setting, those that every seed would share.
-        policy: settled configuration of what is trained; None for references that are not.
+        learner: what is trained; None for references that are not.
         training: how.
-        dagger: whose rounds it is trained on beside the demonstrations, if it is.
-        elsewhere: the same as machines of another kind would settle its policy.
+        rounds: the rounds of DAgger that it is trained on beside the demonstrations, if it is.
     """
 
     setting: str
@@ -99,218 +82,259 @@ class Arm:
     role: str
     env: dict[str, Any]
     evaluation: dict[str, int]
-    demonstrations: Demonstrations | None
-    validated_on: tuple[Demonstrations, ...] = ()
-    policy: PreTrainedConfig | None = None
+    demonstrations: DataSet | None = None
+    validated_on: tuple[DataSet, ...] = ()
+    learner: Learner | None = None
     training: Training | None = None
-    dagger: DaggerConfig | None = None
-    elsewhere: tuple["Arm", ...] = ()
+    rounds: DaggerConfig | None = None
 
     @property
     def id(self) -> str:
         return f"{self.setting}/{self.name}"
 
-    @property
-    def stack(self) -> int:
-        """How many of its seeds are trained as one computation: where each has demonstrations of its own, none are."""
-        own = self.demonstrations.moved or self.dagger
-        return 1 if own else trainer_of(self.policy).stack(self.policy)
-
-    @property
-    def trained_on(self) -> Demonstrations | None:
-        """The demonstrations that are all it is trained on; none where DAgger adds rounds to them.
-
-        Of these alone the trainer's own held-out error speaks.
-        """
-        return None if self.dagger else self.demonstrations
-
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Run(Node):
     """One training seed of an arm: the unit of evidence. Its names are no part of its specification."""
 
     arm: Arm
     seed: int
 
+    kind = "runs"
+
     @property
     def id(self) -> str:
         return f"{self.arm.id}/seed_{self.seed}"
 
-    @cached_property
-    def dagger(self) -> Plan | None:
-        """The rounds that it drives itself."""
-        return Plan(replace(self.arm.dagger, seed=self.seed)) if self.arm.dagger else None
+    def facts(self) -> dict[str, Any]:
+        reference = {} if self.arm.learner else {"reference": self.arm.name}
+        return {**reference, "seed": self.seed, "environment": self.arm.env, "evaluation": self.arm.evaluation}
+
+    def versions(self) -> dict[str, str]:
+        task = get_task(self.arm.env["task"])
+        return versions(*ACTING) | code_of(task.scene, __name__) | self._code_of_agent()
+
+    def _code_of_agent(self) -> dict[str, str]:
+        if self.arm.learner:
+            return self.arm.learner.versions()
+        reference = REFERENCES[self.arm.name]
+        seen = [get_task(self.arm.env["task"]).expert] if reference.is_expert else []
+        return code_of(reference.agent.__module__, *seen)
 
     @cached_property
-    def checkpoint(self) -> Artifact | None:
-        """What it trains."""
+    def inputs(self) -> dict[str, Node]:
+        if self.arm.learner:
+            return {"checkpoint": self.checkpoints}
+        return {"demonstrations": self.arm.demonstrations.node} if self.arm.demonstrations else {}
+
+    @cached_property
+    def plan(self) -> Plan | None:
+        """The rounds of DAgger that it drives itself."""
         arm = self.arm
-        if arm.policy is None:
+        return arm.rounds and Plan(arm.rounds, arm.demonstrations.node, arm.learner, arm.training, self.seed)
+
+    @cached_property
+    def checkpoints(self) -> Checkpoints | None:
+        """What it trains, perhaps with other seeds."""
+        arm = self.arm
+        if arm.learner is None:
             return None
-        if self.dagger:
-            return self.dagger.checkpoint(arm.dagger.rounds)
-        return checkpoint_artifact(arm.policy, arm.training, self.seed, arm.demonstrations.artifact.spec, arm.stack)
-
-    @cached_property
-    def artifact(self) -> Artifact:
-        """Its episodes."""
-        arm = self.arm
-        agent = {"checkpoint": self.checkpoint.spec} if self.checkpoint else {"reference": arm.name, "seed": self.seed}
-        if self.checkpoint is None and arm.demonstrations:
-            agent["demonstrations"] = arm.demonstrations.artifact.spec
-        facts = {"environment": arm.env, "evaluation": arm.evaluation, "versions": self.versions}
-        return Artifact("runs", agent | facts)
+        if self.plan:
+            return self.plan.checkpoint(arm.rounds.rounds)
+        data = arm.demonstrations
+        return Checkpoints.holding(self.seed, arm.learner, arm.training, data.node, alone=bool(data.moved))
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
-        """That of its episodes, and those that they have where machines of another kind made them."""
-        return self.artifact.digest, *(Run(arm, self.seed).artifact.digest for arm in self.arm.elsewhere)
-
-    @cached_property
-    def versions(self) -> dict[str, str]:
-        """What the packages are that may show in its episodes."""
-        policy, reference = self.arm.policy, REFERENCES.get(self.arm.name)
-        task = get_task(self.arm.env["task"])
-        seen = [task.expert] if reference and reference.is_expert else []
-        own = versions_of(policy) if policy else code_of(reference.agent.__module__, *seen)
-        return versions(*ACTING) | code_of(task.scene, MAKES_RUNS) | own
-
-    def heldout(self, demonstrations: Demonstrations) -> Artifact:
-        """Its translation error on what is held out of some demonstrations."""
-        on = {"demonstrations": demonstrations.artifact.spec, "holdout": self.arm.training.holdout}
-        on |= {"versions": code_of(MEASURES_ERRORS)}
-        return Artifact("heldout", {"checkpoint": self.checkpoint.spec, **on})
+        """The run's digest, and those that it has on other kinds of machine."""
+        others = self.arm.learner.elsewhere if self.arm.learner else ()
+        return self.digest, *(Run(replace(self.arm, learner=one), self.seed).digest for one in others)
 
 
-def list_runs(study: Study) -> list[Run]:
-    """Every run of a study: the references of each setting, then its variants, in the study's order.
+@dataclass(frozen=True)
+class Job:
+    """Runs of one variant or reference in one setting that are made in one pass.
 
-    Raises:
-        InputError: a field, anywhere in the study, that nothing can be run with; the message names it.
+    Args:
+        runs: they differ in their seeds and, where each seed has demonstrations of its own, in these.
+        store: where everything is made.
+        times: folder of the file that says what took how long.
+        machine: what makes them.
     """
-    runs = []
-    for name, setting in study.settings.items():
-        with _inside(f"settings.{name}.env"):
-            env = resolve_env(setting.env)
-        sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
-        evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
-        starts = range(study.eval_seed, study.eval_seed + study.episodes)
-        for data in sets.values():
-            check_apart({f"demonstrations '{data.name}'": data.config.starts, "evaluation": starts})
-        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
-        for reference, count in study.references.items():
-            for seeds, drawn in _draws(study, range(count), sets):
-                arm = _reference_arm(study, reference, drawn, common)
-                runs += [Run(arm, seed) for seed in seeds]
-        for variant_name, variant in study.variants_in(name).items():
-            for seeds, drawn in _draws(study, variant.training_seeds, sets):
-                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], common)
-                runs += [Run(arm, seed) for seed in seeds]
-    return runs
+
+    runs: tuple[Run, ...]
+    store: Store
+    times: Path
+    machine: Machine = field(default_factory=Machine)
 
 
-def _draws(
-    study: Study, seeds: range, sets: dict[str, Demonstrations]
-) -> Iterator[tuple[Sequence[int], dict[str, Demonstrations]]]:
-    """Training seeds, and the demonstrations of a setting that they all learn from."""
-    if study.demonstrations == SHARED:
-        yield seeds, sets
+def make_runs(job: Job) -> Iterator[Run]:
+    """Make the runs of a job that nobody has made yet, and yield each as soon as its folder is there.
+
+    A run that fails has a folder as well: one row that says why, and a log with the traceback.
+    """
+    with job.store.claim(job.runs) as claimed:
+        yield from (run for run in job.runs if run not in claimed)
+        runs = [run for run in job.runs if run in claimed]
+        failed = _make_inputs(job, runs)
+        for run, error in failed.items():
+            yield _write_failed(job, run, error)
+        yield from _evaluate(job, [run for run in runs if run not in failed])
+
+
+def _make_inputs(job: Job, runs: Sequence[Run]) -> dict[Run, Exception]:
+    """Make what runs are made of, and return why some of them cannot be made."""
+    failed: dict[Run, Exception] = {}
+    for stage in (DEMONSTRATIONS, TRAINING):
+        wanted = {run: node for run in runs if run not in failed and (node := _wanted(run, stage))}
+        missing = [run for run, node in wanted.items() if not job.store.has(node)]
+        if missing:
+            arm = missing[0].arm
+            told = (ROUNDS if arm.rounds else TRAINING, arm.id, len(missing)) if stage == TRAINING else (stage,)
+            with timed(job.times, *told):
+                lost = job.store.get_all([wanted[run] for run in missing], job.machine)
+            failed |= {run: lost[wanted[run]] for run in missing if wanted[run] in lost}
+    return _without_machines(job, failed)
+
+
+def _wanted(run: Run, stage: str) -> Node | None:
+    """What has to be there for a run at the end of a stage."""
+    if stage == TRAINING:
+        return run.checkpoints
+    return run.arm.demonstrations and run.arm.demonstrations.node
+
+
+def _without_machines(job: Job, failed: dict[Run, Exception]) -> dict[Run, Exception]:
+    """Return errors, which are results of their runs; raise those of the machine (disk, network, memory).
+
+    An error that comes back every time is a result: after `TRIES` times it is returned as any other error is, so that
+    nothing waits for ever for a machine that cannot do its part.
+    """
+    of_machine = {run: error for run, error in failed.items() if _is_of_the_machine(error)}
+    if any(job.store.notes(run) < TRIES - 1 for run in of_machine):
+        for run, error in of_machine.items():
+            job.store.note(run, error)
+        raise next(iter(of_machine.values()))
+    others = {run: error for run, error in of_machine.items() if not isinstance(error, MachineError)}
+    return failed | {run: MachineError(f"{type(error).__name__}: {error}") for run, error in others.items()}
+
+
+def _is_of_the_machine(error: Exception) -> bool:
+    causes = [error, *_causes(error)]
+    return (
+        isinstance(error, TakenError | MachineError | MemoryError)
+        or any(isinstance(one, ConnectionError | TimeoutError | httpx.HTTPError) for one in causes)
+        or any(isinstance(one, OSError) and one.errno in ERRNOS for one in causes)
+        or any(isinstance(one, RuntimeError) and any(words in str(one) for words in OF_THE_MACHINE) for one in causes)
+    )
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    while (error := error.__cause__ or error.__context__) is not None:
+        yield error
+
+
+def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
+    ready = []
+    for run, agent in [(run, caught(_agent, job, run)) for run in runs]:
+        if isinstance(agent, Exception):
+            yield _write_failed(job, run, _without_machines(job, {run: agent})[run])
+        else:
+            ready.append((run, agent))
+    if not ready:
         return
-    for seed in seeds:
-        yield [seed], {name: one.drawn_for(seed) for name, one in sets.items()}
+    runs, agents = zip(*ready, strict=True)
+    arm = runs[0].arm  # in the environment and in how it is evaluated, one is like the other
+    first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
+    filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
+    film = FirstEpisode(next(iter(filmed), None))
+    how = {"on_step": film.add, "filmed": filmed, "n_workers": job.machine.simulators}
+    with timed(job.times, EVALUATION, arm.id, len(runs)):
+        for number, rollout in roll_out(agents, arm.env, range(first, first + count), **how):
+            run, error = runs[number], rollout.error
+            if error is not None:
+                yield _write_failed(job, run, _without_machines(job, {run: error})[run])
+            else:
+                yield _write_finished(job, run, rollout, partial(film.write, number))
 
 
-def _variant_arm(study: Study, name: str, variant: Variant, data: Demonstrations, common: Mapping[str, Any]) -> Arm:
-    with _inside(f"variants.{name}.policy"):
-        policy = settle_policy(variant.policy)
-        check_inputs(policy, common["env"]["obs_type"])
-        others = settled_elsewhere(variant.policy)
-    training = _training_of(study, common["setting"], name, variant)
-    learnt = {"demonstrations": data, "policy": policy, "training": training}
-    if variant.dagger:
-        rounds = _dagger_config(variant)
-        if len(rounds.starts) > SEEDS_APART and study.demonstrations != SHARED:
-            raise InputError(
-                f"variants.{name}.dagger: where each training seed has demonstrations of its own, all rounds together "
-                f"may have {SEEDS_APART:,} episodes at most, not {len(rounds.starts):,}."
-            )
-        base = f"{data.name} --seed_start={data.config.seed_start}" if data.moved else data.name
-        start = rounds.seed_start + data.moved
-        learnt["dagger"] = replace(rounds, base=base, seed_start=start, policy=variant.policy, training=training)
-    with _inside(f"variants.{name}"):
-        first = study.eval_seed
-        starts = {"demonstrations": data.config.starts, "evaluation": range(first, first + study.episodes)}
-        if variant.dagger:
-            starts["rounds"] = learnt["dagger"].starts
-        check_apart(starts)
-    elsewhere = (_variant_arm(study, name, replace(variant, policy=other), data, common) for other in others)
-    return Arm(name=name, role=VARIANT, elsewhere=tuple(elsewhere), **learnt, **common)
+def _agent(job: Job, run: Run) -> Agent:
+    arm = run.arm
+    if arm.learner:
+        return PolicyAgent.from_pretrained(_checkpoint(job, run), **arm.learner.acting)
+    data = arm.demonstrations and arm.demonstrations.node
+    dataset = data and LeRobotDataset(f"local/{data.digest}", root=job.store.folder(data))
+    return REFERENCES[arm.name].agent(get_task(arm.env["task"]), run.seed, dataset)
 
 
-def _dagger_config(variant: Variant) -> DaggerConfig:
-    with _inside(f"dagger {variant.dagger}"):
-        return parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
+def _checkpoint(job: Job, run: Run) -> Path:
+    return checkpoint_of(run.seed, job.store.folder(run.checkpoints))
 
 
-def _reference_arm(study: Study, name: str, sets: Mapping[str, Demonstrations], common: Mapping[str, Any]) -> Arm:
-    if name not in REFERENCES:
-        raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
-    reference, setting = REFERENCES[name], common["setting"]
-    arm = Arm(name=name, role=REFERENCE if reference.looks else SIGHTLESS, demonstrations=None, **common)
-    if reference.policy:
-        base, variant = _variant_with(study, name, reference, setting)
-        with _inside(f"references.{name}"):
-            fields = {**variant.policy, **reference.policy}
-            policies = [settle_policy(one) for one in (fields, *settled_elsewhere(fields))]
-            check_inputs(policies[0], common["env"]["obs_type"])
-        training = _training_of(study, setting, base, variant)
-        data = sets[study.data_for(setting, variant)]
-        here, *elsewhere = [replace(arm, demonstrations=data, policy=one, training=training) for one in policies]
-        return replace(here, elsewhere=tuple(elsewhere))
-    data = sets[study.settings[setting].data] if reference.reads_demonstrations else None
-    return replace(arm, demonstrations=data, validated_on=())
+def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
+    row = _row(job, run, rollout.backend)
+    rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
+    return _write(job, run, rows, write_video, rollout.recordings(run.arm.env))
 
 
-def _variant_with(study: Study, name: str, reference: Reference, setting: str) -> tuple[str, Variant]:
-    """The first variant in a setting, none of DAgger's, whose policy has the fields that a reference sets."""
-    for of_variant, variant in study.variants_in(setting).items():
-        if variant.dagger:
-            continue
-        with _inside(f"variants.{of_variant}.policy"):
-            kind = type(decode_policy(variant.policy))
-        if all(hasattr(kind, field) for field in reference.policy):
-            return of_variant, variant
-    fields = ", ".join(reference.policy)
-    raise InputError(f"The reference '{name}' needs a variant whose policy has {fields}, as frozen_vit has.")
+def _write_failed(job: Job, run: Run, error: Exception) -> Run:
+    job.store.note(run, error)
+    said = " ".join(f"{type(error).__name__}: {error}".split())
+    return _write(job, run, [replace(_row(job, run), error_kind=kind_of(error), error=said)])
 
 
-def _training_of(study: Study, setting: str, name: str, variant: Variant) -> Training:
-    with _inside(f"settings.{setting}.training"):
-        training = decode(Training, {**asdict(study.training), **study.settings[setting].training})
-    with _inside(f"variants.{name}.training"):
-        return decode(Training, {**asdict(training), **variant.training})
+def _write(
+    job: Job,
+    run: Run,
+    rows: list[EpisodeRow],
+    write_video: Callable[[Path], None] = lambda path: None,
+    recordings: Sequence[Recording] = (),
+) -> Run:
+    with job.store.writing(run) as folder:
+        folder.mkdir()
+        write_rows(rows, folder / EPISODES, EpisodeRow)
+        if recordings:
+            write_recordings(recordings, folder / RECORDINGS)
+        write_video(folder / VIDEO)
+        if run.checkpoints and job.store.has(run.checkpoints):
+            (folder / CHECKPOINT).symlink_to(Path("..", "..") / _checkpoint(job, run).relative_to(job.store.root))
+    return run
 
 
-def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
-    if fields.get("type", OURS) != OURS:
-        raise InputError(f"type must be {OURS}, not {fields['type']!a}: a study evaluates in no other environment.")
-    env = decode(EnvConfig, {**fields, "type": OURS}).gym_kwargs
-    task = get_task(env["task"])  # one: a setting is no suite
-    length = env["episode_length"] or task.horizon
-    light_robot, backend = resolve_rendering(env["light_robot"], env["render_backend"])
-    return env | {"episode_length": length, "light_robot": light_robot, "render_backend": backend}
+def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
+    """What every row of a run says."""
+    arm, weights, stands_on = run.arm, None, {}
+    if run.checkpoints and job.store.has(run.checkpoints):
+        model = _checkpoint(job, run) / "model.safetensors"
+        weights = file_sha256(model) if model.exists() else None
+        stands_on = made_of(job.store.folder(run.checkpoints))
+    return EpisodeRow(
+        run=run.digest,
+        training_seed=run.seed,
+        evaluation_seed=arm.evaluation["seed"],
+        episode=0,
+        dataset_sha256=_dataset_sha256(job, run),
+        weights_sha256=weights,
+        environment_sha256=digest({"environment": arm.env, "backend": backend}),
+        backend=backend,
+        versions=json.dumps(run.spec["versions"] | stands_on | _made_on(run, backend)),
+    )
 
 
-def _read_demonstrations(setting: str, data: str) -> Demonstrations:
-    with _inside(f"settings.{setting}, data {data}"):
-        return Demonstrations(data, parse_named(GenerateConfig, "generate", data, ["--repo_id=local/any"]))
+def _made_on(run: Run, backend: str | None) -> dict[str, str]:
+    """The processor that made a row, and the graphics card where the policy or the renderer used one.
+
+    Args:
+        backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
+    """
+    device = run.arm.learner.places["device"] if run.arm.learner else None
+    acts = (device or "").startswith("cuda")
+    if not acts and "cuda" not in (backend or ""):
+        return {"processor": processor()}
+    return {"processor": processor(), "card": torch.cuda.get_device_name(device if acts else None)}
 
 
-@contextmanager
-def _inside(where: str) -> Iterator[None]:
-    """Say in which part of the study a field lies that cannot be used."""
-    try:
-        yield
-    except UserError as error:
-        raise type(error)(f"{where}: {error}") from error
+def _dataset_sha256(job: Job, run: Run) -> str | None:
+    """Hash of what the run learnt from, or replays."""
+    made = run.checkpoints.demonstrations if run.checkpoints else run.inputs.get("demonstrations")
+    return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

@@ -2,11 +2,11 @@
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
-from typing import Any
 
-from lerobot_constructskill.artifacts.revisions import BEFORE, EDITED
+from lerobot_constructskill.artifacts.differences import differences, versions_that_differ
+from lerobot_constructskill.artifacts.revisions import BEFORE
 from lerobot_constructskill.artifacts.store import LOG
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
@@ -52,28 +52,16 @@ def _changed(table: Table, run: Run) -> str | None:
     row = table.outdated(run)
     if row is None:
         return None
-    before = table.store.spec("runs", row.run) if row.run else None
-    if before is None:  # a published folder has the rows alone
-        told = json.loads(row.versions) if row.versions else run.versions
+    made = table.store.spec(run.kind, row.run) if row.run else None
+    if made:
+        changed = differences(made, run)
+    else:  # a published folder has the rows alone
+        told = json.loads(row.versions) if row.versions else {}
         if BEFORE in told.values():
             return f"code, {BEFORE}"
-        before = {"versions": told}
-    now = run.artifact.spec if before.keys() > {"versions"} else {"versions": run.versions}
-    changed = list(dict.fromkeys(_differences(before, now)))
+        changed = versions_that_differ(told, run.spec["versions"])
     more = f" and {len(changed) - SHOWN} more" if len(changed) > SHOWN else ""
     return ", ".join(changed[:SHOWN]) + more if changed else "specification"
-
-
-def _differences(before: Any, now: Any, name: str = "") -> Iterator[str]:
-    """What differs between two specifications: packages and rooms by their names, settings by their places."""
-    if not (isinstance(before, Mapping) and isinstance(now, Mapping)):
-        if before != now:
-            edited = now.partition(EDITED)[2] if isinstance(now, str) else ""
-            yield f"{name} ({edited})" if edited else name
-        return
-    for key in dict.fromkeys([*now, *before]):
-        inner = key if name.endswith("versions") else f"{name}.{key}".lstrip(".")
-        yield from _differences(before.get(key), now.get(key), inner)
 
 
 def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
@@ -82,7 +70,7 @@ def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
     lines = []
     for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
         own = [run for run, _ in alike]
-        log = table.store.folder(own[0].artifact) / LOG
+        log = table.store.folder(own[0]) / LOG
         lines.append(f"    {_seeds(own)} ({kind}): {error} (log: {log})")
     return lines
 
@@ -94,8 +82,8 @@ def _seeds(runs: Sequence[Run]) -> str:
 def _seconds(table: Table, runs: Sequence[Run]) -> float | None:
     """How long runs of one arm take, by how long its last ones took in this folder; None if that is not known."""
     took = seconds_per_run(table.root).get(_arm(runs[0]), {})
-    untrained = [run for run in runs if run.checkpoint and not table.store.has(run.checkpoint)]
-    training = ROUNDS if runs[0].arm.dagger else TRAINING
+    untrained = [run for run in runs if run.checkpoints and not table.store.has(run.checkpoints)]
+    training = ROUNDS if runs[0].arm.rounds else TRAINING
     if EVALUATION not in took or (untrained and training not in took):
         return None
     return len(runs) * took[EVALUATION] + (len(untrained) * took[training] if untrained else 0)
@@ -121,6 +109,6 @@ def _total(table: Table, due: Sequence[Run]) -> str:
     time = _about(sum(known)) if known else "time unknown"
     beside = " and some of unknown time" if known and len(known) < len(times) else ""
     used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
-    absent = [name for name, data in used.items() if not table.store.has(data.artifact)]
+    absent = [name for name, data in used.items() if not table.store.has(data.node)]
     first = f"; first the demonstrations: {', '.join(absent)}" if absent else ""
     return f"To make: {plural(len(due), 'run')}, {time}{beside}{first}"

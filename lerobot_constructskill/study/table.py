@@ -15,11 +15,10 @@ from typing import Any
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.execute import EPISODES, FILMED_SEED, VIDEO
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
-from lerobot_constructskill.study.runs import Run
+from lerobot_constructskill.study.runs import EPISODES, FILMED_SEED, VIDEO, Run
 from lerobot_constructskill.study.spec import video_path
-from lerobot_constructskill.study.validate import read_error
+from lerobot_constructskill.study.validate import measured
 
 HELDOUT = ("heldout_mse_m2", "heldout_mse_m2_by_data")
 """Columns of `Row` that follow from a run's checkpoint: on the setting's own demonstrations, and on each by name."""
@@ -53,11 +52,11 @@ class Table:
         Raises:
             InputError: its folder holds something else.
         """
-        name, kept = run.artifact.digest, self._kept_rows(run)
+        name, kept = run.digest, self._kept_rows(run)
         if kept and kept[0].run != name:  # of another kind of machine: what is published stays as it is
             return kept
-        if name not in self._made and self.store.has(run.artifact):
-            file = self.store.folder(run.artifact) / EPISODES
+        if name not in self._made and self.store.has(run):
+            file = self.store.folder(run) / EPISODES
             if not file.is_file():
                 raise InputError(f"{file.parent} has no episodes, so it is not a run of this package: move it away.")
             self._made[name] = load_rows(file, EpisodeRow)
@@ -84,7 +83,7 @@ class Table:
         gone = [
             row
             for key, rows in self._kept.items()
-            if key not in ours and not (key[-1] and self.store.keeps("runs", key[-1]))
+            if key not in ours and not (key[-1] and self.store.spec(Run.kind, key[-1]))
             for row in rows
             if not (row.error_kind and _name_of(row) in names)
         ]
@@ -92,11 +91,11 @@ class Table:
 
     def forget_failure(self, run: Run) -> None:
         """Discard a run that failed, so that it is made anew, unless somebody has done so."""
-        with self.store.claim([run.artifact]):
-            self._made.pop(run.artifact.digest, None)
+        with self.store.claim([run]):
+            self._made.pop(run.digest, None)
             if (rows := self.episodes(run)) and rows[0].error_kind:
-                self.store.discard(run.artifact)
-                self._made.pop(run.artifact.digest)
+                self.store.discard(run)
+                self._made.pop(run.digest)
 
     def write(self) -> None:
         """Write the table and the videos into the study's folder."""
@@ -117,7 +116,7 @@ class Table:
 
     def _missing_row(self, run: Run) -> Row:
         seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.evaluation["seed"]}
-        return Row(run=run.artifact.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))
+        return Row(run=run.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))
 
     def _made_rows(self, run: Run) -> Iterator[Row]:
         if isinstance(self.episodes(run)[0], Row):  # of the table in the folder
@@ -132,19 +131,19 @@ class Table:
 
         They are those of the table in the folder where the checkpoint has been removed since.
         """
-        if run.checkpoint is None:
+        if run.checkpoints is None:
             return {}
-        if not self.store.has(run.checkpoint):
+        if not self.store.has(run.checkpoints):
             kept = self._kept_rows(run)
             return {name: getattr(kept[0], name) for name in HELDOUT} if kept else {}
-        errors = {data.name: read_error(run, data, self.store) for data in run.arm.validated_on}
+        errors = {data.name: measured(run, data, self.store) for data in run.arm.validated_on}
         errors = {name: error for name, error in errors.items() if error is not None}
         own, every = HELDOUT
         return {own: errors.get(run.arm.validated_on[0].name), every: json.dumps(errors)} if errors else {}
 
     def _video(self, run: Run) -> str | None:
         """Copy the run's video beside the table and return its path there."""
-        video = self.store.folder(run.artifact) / VIDEO
+        video = self.store.folder(run) / VIDEO
         if run.seed != FILMED_SEED or not video.exists():
             return None
         path = video_path(run.arm.setting, run.arm.name)

@@ -1,24 +1,24 @@
-"""Checkpoints in a store: a policy's fields settled, what a checkpoint is found by, and what it says of its making."""
+"""Checkpoints as nodes of a store: what training seeds of a policy make of demonstrations."""
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypedDict
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset
 from lerobot.utils import OBS_STATE
 
-from lerobot_constructskill.artifacts.code import check_unedited
+from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.store import Artifact, Store
-from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.contract import OBS_TYPES, held_out
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json
-from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import policy_spec, trainer_of, versions_of
+from lerobot_constructskill.training.trainers import Learner, flush_denormals
 
 LEARNING = ("lerobot", "torch", "numpy")
 """Packages whose versions may show in any checkpoint."""
@@ -27,27 +27,14 @@ ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
 
 FACTS = "training.json"
-"""In a checkpoint's folder: what its trainer says of it."""
+"""File beside the checkpoints: what rows say of them."""
 
 
-class _Facts(TypedDict, total=False):
-    heldout_mse_m2: float | None
+class _Facts(TypedDict):
     made_of: dict[str, str]
 
 
-SAID = Json("what a trainer says of a checkpoint", _Facts)
-
-
-def settle_policy(fields: Mapping[str, Any]) -> PreTrainedConfig:
-    """The configuration of these fields, with everything written out that it leaves to the machine."""
-    config = decode_policy(fields)
-    return trainer_of(config).settle(config)
-
-
-def settled_elsewhere(fields: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The same fields for each other kind of machine, with that written out which it would settle otherwise."""
-    config = decode_policy(fields)
-    return [{**fields, **others} for others in trainer_of(config).settled_elsewhere(config)]
+SAID = Json("what a trainer says of its checkpoints", _Facts)
 
 
 def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
@@ -68,33 +55,67 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
         )
 
 
-def checkpoint_artifact(
-    policy: PreTrainedConfig, training: Training, seed: int, demonstrations: Mapping[str, Any], stack: int
-) -> Artifact:
-    """What a training seed of a settled policy makes of demonstrations with this specification.
+@dataclass(frozen=True, eq=False)
+class Checkpoints(Node):
+    """The checkpoints of training seeds that are one computation; that of seed N lies in the folder `seed_N`.
 
     Args:
-        stack: how many seeds are trained as one computation, `Trainer.stack` or 1.
+        learner: what is trained.
+        training: how.
+        seeds: every seed of the computation.
+        demonstrations: what it is trained on, every `training.holdout`-th episode excepted.
     """
-    facts = {"policy": policy_spec(policy), "training": asdict(training), "seed": seed, "stack": stack}
-    made_by = versions(*LEARNING) | versions_of(policy)
-    return Artifact("checkpoints", facts | {"demonstrations": demonstrations, "versions": made_by})
+
+    learner: Learner
+    training: Training
+    seeds: range
+    demonstrations: Node
+
+    kind = "checkpoints"
+
+    @classmethod
+    def holding(
+        cls, seed: int, learner: Learner, training: Training, demonstrations: Node, alone: bool = False
+    ) -> "Checkpoints":
+        """Those among which is the checkpoint of a seed.
+
+        Args:
+            alone: train the seed by itself, also where its trainer stacks seeds.
+        """
+        stack = 1 if alone else learner.trainer.stack(learner.config)
+        first = seed // stack * stack
+        return cls(learner, training, range(first, first + stack), demonstrations)
+
+    @property
+    def is_single_threaded(self) -> bool:
+        return self.learner.trainer.is_single_threaded(self.learner.config)
+
+    def facts(self) -> dict[str, Any]:
+        seeds = [self.seeds.start, self.seeds.stop]
+        return {"policy": self.learner.facts(), "training": asdict(self.training), "seeds": seeds}
+
+    def versions(self) -> dict[str, str]:
+        return versions(*LEARNING) | code_of(__name__) | self.learner.versions()
+
+    @cached_property
+    def inputs(self) -> dict[str, Node]:
+        return {"data": self.learner.trainer.learns_from(self.learner.here, self.demonstrations)}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Train the seeds. Raises whatever the trainer raises."""
+        flush_denormals()
+        dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
+        kept_out = held_out(dataset.num_episodes, self.training.holdout)
+        folder.mkdir()
+        made_of = self.learner.trainer.fit(self.learner.here, dataset, self.seeds, self.training, kept_out, folder)
+        (folder / FACTS).write_text(json.dumps({"made_of": made_of}) + "\n", encoding="utf-8")
 
 
-@contextmanager
-def writing_checkpoint(store: Store, checkpoint: Artifact, policy: PreTrainedConfig, **facts: Any) -> Iterator[Path]:
-    """A `trainers.Writer`, but for its first three arguments.
-
-    Raises:
-        MachineError: the policy's code is not what it was when the checkpoint was asked for.
-    """
-    with store.writing(checkpoint) as folder:
-        yield folder
-        check_unedited(checkpoint.spec["versions"], versions_of(policy))
-        (folder / FACTS).write_text(json.dumps(facts) + "\n", encoding="utf-8")
+def checkpoint_of(seed: int, folder: Path) -> Path:
+    """The checkpoint of a seed in the folder of a `Checkpoints` node."""
+    return folder / f"seed_{seed}"
 
 
-def read_facts(checkpoint: Path) -> _Facts:
-    """What a checkpoint says of its training. Raises InputError where its file is damaged."""
-    file = checkpoint / FACTS
-    return SAID.read(file) if file.exists() else {}
+def made_of(folder: Path) -> dict[str, str]:
+    """What rows say of the checkpoints in a `Checkpoints` folder. Raises InputError where its file is damaged."""
+    return SAID.read(folder / FACTS)["made_of"]

@@ -6,7 +6,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import draccus
@@ -14,13 +14,13 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
-from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
-from lerobot_constructskill.training.trainers import NO_MEMORY, OF_THE_MACHINE, Trainer, Writer
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import NO_MEMORY, OF_THE_MACHINE, Trainer
 
 KILLED = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-"""What ends a process from outside: somebody, or the kernel for want of memory. No policy ends itself like this."""
+"""Signals that a user sends, or the kernel when memory runs out."""
 
 LOADERS = 4
 """LeRobot's own number of loading processes. Each imports all of LeRobot: no more than there are cores to spare."""
@@ -40,37 +40,35 @@ class LeRobotTrainer(Trainer):
     def fit(
         self,
         config: PreTrainedConfig,
-        demonstrations: LeRobotDataset,
-        writers: Mapping[int, Writer],
-        epochs: int,
-        batch_size: int,
+        dataset: LeRobotDataset,
+        seeds: Sequence[int],
+        training: Training,
         held_out: Sequence[int],
-        store: Store,
-    ) -> None:
+        folder: Path,
+    ) -> dict[str, str]:
         """Train one seed after another, as `Trainer.fit` says."""
-        kept = sorted({*range(demonstrations.num_episodes)} - {*held_out})
-        frames = sum(demonstrations.meta.episodes["length"][i] for i in kept)
-        steps = epochs * -(-frames // batch_size)
+        kept = sorted({*range(dataset.num_episodes)} - {*held_out})
+        frames = sum(dataset.meta.episodes["length"][i] for i in kept)
+        steps = training.epochs * -(-frames // training.batch_size)
         command = [
             str(Path(sys.executable).parent / "lerobot-train"),
-            f"--dataset.repo_id={demonstrations.repo_id}",
-            f"--dataset.root={demonstrations.root}",
+            f"--dataset.repo_id={dataset.repo_id}",
+            f"--dataset.root={dataset.root}",
             f"--dataset.episodes={kept}",
             *_flags(config),
             "--policy.push_to_hub=false",
-            f"--batch_size={batch_size}",
+            f"--batch_size={training.batch_size}",
             f"--steps={steps}",
             f"--save_freq={steps}",
             "--env_eval_freq=0",
             f"--num_workers={min(cores() - 1, LOADERS)}",
         ]
-        for seed, write in writers.items():
-            with write() as folder:
-                output = folder.with_name(f"lerobot-train-{os.getpid()}")
-                log = folder.with_name(LOG)
-                _call([*command, f"--seed={seed}", f"--output_dir={output}"], log)
-                (output / LAST_CHECKPOINT).resolve().rename(folder)
-                log.rename(folder / LOG)
+        for seed in seeds:
+            output, log = folder.with_name(f"lerobot-train-{os.getpid()}"), folder.with_name(LOG)
+            _call([*command, f"--seed={seed}", f"--output_dir={output}"], log)
+            (output / LAST_CHECKPOINT).resolve().rename(folder / f"seed_{seed}")
+            log.rename(folder / f"seed_{seed}" / LOG)
+        return {}
 
 
 def _flags(config: PreTrainedConfig) -> list[str]:
@@ -103,7 +101,7 @@ def _judge(status: int, said: str) -> Exception:
     if -status in KILLED:
         name = signal.Signals(-status).name
         return MachineError(
-            f"lerobot-train was killed ({name}), for want of memory perhaps; the same command goes on."
+            f"lerobot-train was killed ({name}), perhaps out of memory; run the same command to continue."
         )
     if any(words in said for words in (*NO_MEMORY, "killed by signal")):
         return MachineError(

@@ -1,7 +1,8 @@
 """What trains a policy type in a study: the class that its configuration names, or `lerobot-train`."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,26 +14,24 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import file_sha256, versions
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.store import Node
+from lerobot_constructskill.policy_types import decode_policy
+from lerobot_constructskill.training.recipe import Training
 
 NO_MEMORY = ("can't allocate memory", "out of memory", "OutOfDeviceMemory", "OutOfHostMemory")
-"""What torch, on a CPU and on a GPU, and Vulkan say in a `RuntimeError` for want of it."""
+"""What torch, on a CPU and on a GPU, and Vulkan say in a `RuntimeError` when memory runs out."""
 
 OF_THE_MACHINE = (
     *(*NO_MEMORY, "No space left on device", "Disk quota exceeded", "CUDA error", "NVIDIA driver"),
     *("ConnectError", "ConnectionError", "ConnectTimeout", "ReadTimeout", "Connection reset"),
 )
-"""What an error says that is no fault of the policy: disks, network and GPU may do the next time what they did not."""
+"""What an error says that is no fault of the policy: of a disk, the network or a GPU, which may work the next time."""
 
 BY_LEROBOT = "lerobot_constructskill.training.lerobot_train:LeRobotTrainer"
-"""What trains policies whose configuration names nothing else."""
+"""The trainer of policies whose configuration names no other."""
 
-ELSEWHERE = ("push_to_hub", "repo_id", "private", "tags", "license")
-"""Fields of every policy that say where it is published, and not what it becomes."""
-
-type Writer = Callable[..., AbstractContextManager[Path]]
-"""Gives the path of a folder that is not there yet; the checkpoint appears when the block ends. It takes what rows are
-to say of the checkpoint: `heldout_mse_m2`, its error on what is held out, and `made_of`, name to what it stands on."""
+PUBLISHED = ("push_to_hub", "repo_id", "private", "tags", "license")
+"""Fields of every policy that say where it is published. They do not show in its weights."""
 
 
 def flush_denormals() -> None:
@@ -51,65 +50,118 @@ class Trainer:
     """Fields of the configuration that say where something lies and do not show in a checkpoint's weights."""
     packages: tuple[str, ...] = ()
     """Distributions beside LeRobot, torch and those of the policy and the trainer whose versions may show in them."""
-    heldout_mse: Callable[..., list[float | None]] | None = None
-    """`(config, checkpoints, demonstrations, held_out, store)`: the error of each checkpoint's translations on
-    episodes of other demonstrations, in m2; None where they lack one of its inputs. `config` says where things lie and
-    compute now. A trainer that has it tells its writers the error on its own demonstrations. For all others a study
-    measures both with the checkpoint, as any policy's (`rollout/heldout.py`)."""
 
-    def seeds_together(self, config: PreTrainedConfig) -> bool:
-        """Whether `fit` should get many seeds at once. Where it raises, those failed that it has not written."""
-        return False
+    def settle(self, config: PreTrainedConfig) -> list[PreTrainedConfig]:
+        """Write out what a configuration leaves to the machine.
+
+        Returns:
+            The configuration on this machine, and behind it those of the other kinds of machine. Of a GPU that this
+            machine lacks nothing is known: LeRobot takes the CPU in its place.
+        """
+        return [config] if config.device == "cpu" else [config, replace(config, device="cpu")]
 
     def stack(self, config: PreTrainedConfig) -> int:
         """How many seeds are one computation, whose bits may depend on all of them: 0 to 9, 10 to 19 and so on for 10.
 
-        `fit` then gets all seeds of such a stack, also those that nobody asked for: what is missing of a study shows
-        in nothing that is made.
+        `fit` then gets all seeds of such a stack, whichever of them were asked for.
         """
         return 1
 
-    def settle(self, config: PreTrainedConfig) -> PreTrainedConfig:
-        """Return the configuration with everything written out that it leaves to the machine."""
-        return config
+    def is_single_threaded(self, config: PreTrainedConfig) -> bool:
+        """Whether `fit` keeps one core busy, so that several stacks are trained at the same time."""
+        return False
 
-    def idle(self, config: PreTrainedConfig) -> tuple[str, ...]:
-        """Fields that a policy of this configuration has no use for, so that they do not show in its checkpoint."""
-        return ()
-
-    def settled_elsewhere(self, config: PreTrainedConfig) -> list[dict[str, Any]]:
-        """The fields that machines of another kind would write out otherwise: one dictionary for each kind.
-
-        Of a GPU that this machine does not have nothing can be known: LeRobot takes the CPU in its place.
-        """
-        return [] if config.device == "cpu" else [{"device": "cpu"}]
-
-    @contextmanager
-    def joined(
-        self, config: PreTrainedConfig, whole: LeRobotDataset, parts: Sequence[LeRobotDataset], store: Store
-    ) -> Iterator[None]:
-        """Have ready for the block whatever `fit` computes of every frame of `whole`, which is its parts in order.
-
-        What was computed of a part once is not computed again.
-        """
-        yield
+    def learns_from(self, config: PreTrainedConfig, demonstrations: Node) -> Node:
+        """The data set that `fit` gets: the demonstrations, or what is computed of them once for all seeds."""
+        return demonstrations
 
     def fit(
         self,
         config: PreTrainedConfig,
-        demonstrations: LeRobotDataset,
-        writers: Mapping[int, Writer | None],
-        epochs: int,
-        batch_size: int,
+        dataset: LeRobotDataset,
+        seeds: Sequence[int],
+        training: Training,
         held_out: Sequence[int],
-        store: Store,
-    ) -> None:
-        """Train each seed of `writers` on the episodes that are not held out, and write its checkpoint.
+        folder: Path,
+    ) -> dict[str, str]:
+        """Train each seed on the episodes that are not held out, and write its checkpoint to `folder/seed_<seed>`.
 
-        A checkpoint is what `lerobot-eval --policy.path` loads. A seed of a stack that has no writer is trained with
-        the others and not kept.
+        A checkpoint is what `lerobot-eval --policy.path` loads.
+
+        Args:
+            dataset: what `learns_from` returned.
+            held_out: numbers of the episodes that are not trained on.
+
+        Returns:
+            What rows say of the checkpoints: name to what they stand on.
         """
         raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class Learner:
+    """A policy that is to be trained.
+
+    Args:
+        config: the configuration, in which all that the machine decides is written out, and all that does not show in
+            a checkpoint has its default.
+        places: the fields that do not show in a checkpoint: where weights lie, which of several GPUs computes.
+        elsewhere: the same policy as other kinds of machine would train it.
+    """
+
+    config: PreTrainedConfig
+    places: Mapping[str, Any]
+    elsewhere: tuple["Learner", ...] = ()
+
+    @classmethod
+    def of(cls, fields: Mapping[str, Any]) -> "Learner":
+        """The policy of some plain fields, `type` among them. Raises InputError where they do not make one."""
+        config = decode_policy(fields)
+        here, *elsewhere = (cls._split(one) for one in trainer_of(config).settle(config))
+        return replace(here, elsewhere=tuple(elsewhere))
+
+    @classmethod
+    def _split(cls, config: PreTrainedConfig) -> "Learner":
+        default, names = type(config)(device="cpu"), (*PUBLISHED, *trainer_of(config).places)
+        plain = {name: getattr(default, name) for name in names} | {"device": str(config.device).partition(":")[0]}
+        return cls(_with(config, plain), {name: getattr(config, name) for name in plain})
+
+    @property
+    def here(self) -> PreTrainedConfig:
+        """A configuration to train with, which is the caller's own."""
+        return _with(self.config, self.places)
+
+    @property
+    def acting(self) -> dict[str, Any]:
+        """Fields that a checkpoint of it has to be loaded with here: a path may differ by now."""
+        return {name: self.places[name] for name in ("device", *self.trainer.places)}
+
+    @property
+    def trainer(self) -> Trainer:
+        return trainer_of(self.config)
+
+    def facts(self) -> dict[str, Any]:
+        """Every field that shows in a checkpoint.
+
+        A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for
+        whatever it holds, unless `pretrained_revision` says which commit.
+        """
+        fields = {"type": self.config.type, **draccus.encode(self.config)}
+        start = self.config.pretrained_path
+        if start and (weights := Path(start) / "model.safetensors").is_file():
+            fields["pretrained_path"] = f"sha256 {file_sha256(weights)}"
+        return fields
+
+    def versions(self) -> dict[str, str]:
+        return versions_of(self.config)
+
+
+def _with(config: PreTrainedConfig, fields: Mapping[str, Any]) -> PreTrainedConfig:
+    """A copy with other fields, without LeRobot's look at the machine: a device that it lacks may be named."""
+    copy = deepcopy(config)
+    for name, value in fields.items():
+        setattr(copy, name, value)
+    return copy
 
 
 def trainer_of(config: PreTrainedConfig) -> Trainer:
@@ -121,24 +173,7 @@ def trainer_of(config: PreTrainedConfig) -> Trainer:
 def versions_of(config: PreTrainedConfig) -> dict[str, str]:
     """What the packages are that may show in what such a policy learns and does, beside LeRobot, torch and ours.
 
-    Others' code, of the policy and of its trainer, is told by its source too.
+    Code of other packages, of the policy and of its trainer, is told by its source too.
     """
     trainer = trainer_of(config)
     return versions(*trainer.packages) | code_of(type(config).__module__, type(trainer).__module__)
-
-
-def policy_spec(config: PreTrainedConfig) -> dict[str, Any]:
-    """Every field of a settled configuration that shows in its checkpoint.
-
-    A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for whatever
-    it holds, unless `pretrained_revision` says which commit.
-    """
-    fields = draccus.encode(config) | {
-        "device": str(config.device).partition(":")[0]
-    }  # which of several does not show
-    trainer = trainer_of(config)
-    for name in (*ELSEWHERE, *trainer.places, *trainer.idle(config)):
-        fields.pop(name, None)
-    if config.pretrained_path and (weights := Path(config.pretrained_path) / "model.safetensors").is_file():
-        fields["pretrained_path"] = f"sha256 {file_sha256(weights)}"
-    return {"type": config.type, **fields}

@@ -48,43 +48,64 @@ def scenario_file(root: Path) -> None:
 
 
 def scenario_store(root: Path) -> None:
-    """Two artefacts of which one links to the other, one that failed before, and one that is made anew."""
-    from lerobot_constructskill.artifacts.store import Artifact, Store
+    """A node and two that it is made of, of which one passes and one is made anew; and one that failed before."""
+    from dataclasses import dataclass
+    from functools import cached_property
 
-    store, said = Store(root / "store"), Artifact("things", {"name": "said"})
-    first, second = Artifact("things", {"name": "first"}), Artifact("things", {"name": "second"})
-    for artifact in (first, second, said):
-        with store.claim([artifact]) as missing:
-            for one in missing:
-                if one is said:
-                    store.log(one).parent.mkdir(parents=True, exist_ok=True)
-                    store.log(one).write_text("what was said\n")
-                with store.writing(one) as folder:
-                    folder.mkdir()
-                    (folder / "content").write_text(one.spec["name"])
-                    if one is second:
-                        (folder / "link").symlink_to(Path("..") / first.digest)
+    from lerobot_constructskill.artifacts.store import Node, Store
+
+    @dataclass(frozen=True, eq=False)
+    class Thing(Node):
+        name: str
+        made_of: tuple[Node, ...] = ()
+        is_passing: bool = False
+        kind = "things"
+
+        def facts(self):
+            return {"name": self.name}
+
+        def versions(self):
+            return {}
+
+        @cached_property
+        def inputs(self):
+            return {one.name: one for one in self.made_of}
+
+        def make(self, folder, inputs, machine):
+            folder.mkdir()
+            (folder / "content").write_text(self.name)
+            for name, path in inputs.items():
+                (folder / name).symlink_to(Path("..") / path.name)
+
+    store, said, first = Store(root / "store"), Thing("said"), Thing("first")
+    if not store.has(said):
+        store.log(said).parent.mkdir(parents=True, exist_ok=True)
+        store.log(said).write_text("what was said\n")
+    for node in (Thing("second", (first, Thing("passing", (), True))), said):
+        store.get(node)
+        with store.claim([node]):
+            pass  # which tidies up after a process that was killed when it was whole
     if not (root / "again").exists():
-        with store.claim([second]) as missing:
+        with store.claim([first]) as missing:
             if not missing:
-                store.discard(second)
+                store.discard(first)
         (root / "again").touch()
-        scenario_store(root)
+    store.get(first)
 
 
 def scenario_study(root: Path) -> None:
     """The runs and the table of a study whose runs fail, each as a row, for want of a simulator."""
     import lerobot_constructskill.plugin  # noqa: F401
     from lerobot_constructskill.artifacts.store import Store
-    from lerobot_constructskill.study import execute
-    from lerobot_constructskill.study.run import run_study
+    from lerobot_constructskill.study import runs
+    from lerobot_constructskill.study.session import run_study
     from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 
-    def no_agents(job, runs):
+    def no_agents(job, run):
         raise ValueError("no simulator here")
 
-    execute._agent = no_agents
-    execute._train = lambda job, runs: {}
+    runs._agent = no_agents
+    runs._make_inputs = lambda job, runs: {}
     Store.note = lambda *_: None  # a log says when
     policy = {"type": "act", "pretrained_backbone_weights": None}
     setting = Setting("smoke", {"obs_type": "pixels_agent_pos"})

@@ -18,8 +18,8 @@ INERT = {
     *("__init__.py", "py.typed", "plugin.py", "analysis", "artifacts", "board", "comparison", "dataset", "scripts"),
     # What these make of a user's words stands in specifications, and what they refuse is not made.
     *("bounds.py", "errors.py", "files.py", "parsing.py", "policy_types.py", "presets.py", "progress.py", "tags.py"),
-    *(f"study/{name}.py" for name in ("__init__", "rows", "run", "runs", "spec", "status", "table", "timing")),
-    "study/validate.py",  # which measures by `rollout`
+    *(f"study/{name}.py" for name in ("__init__", "plan", "rows", "session", "spec", "status", "table", "timing")),
+    *("features/__init__.py", "study/validate.py"),  # the latter measures by `rollout`
 }
 """Files and folders that cannot change the bytes of anything that is made."""
 

@@ -1,15 +1,59 @@
-"""A store: everything is made once, found by what made it, and whole or not there."""
+"""A store: every node is made once, with what it is made of, found by what made it, and whole or not there."""
 
 import json
 import multiprocessing
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 
 import pytest
 
+from lerobot_constructskill.artifacts import store as module
+from lerobot_constructskill.artifacts.differences import differences, outdated
 from lerobot_constructskill.artifacts.digests import digest
-from lerobot_constructskill.artifacts.store import LOG, SPEC, Artifact, Store
+from lerobot_constructskill.artifacts.store import LOG, SPEC, Machine, Node, Store
+from lerobot_constructskill.errors import InputError, MachineError, MissingError
 
-ONE, OTHER = Artifact("things", {"a": 1, "b": [1, 2]}), Artifact("things", {"a": 2, "b": [1, 2]})
+CODE = {"numpy": "1"}
+"""What the things are made by; a test edits it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Thing(Node):
+    """Text of its name and of the things that it is made of."""
+
+    name: str
+    made_of: tuple["Thing", ...] = ()
+    seconds: float = 0.0
+    is_passing: bool = False
+    is_single_threaded: bool = False
+
+    kind = "things"
+    keeps = "parts"
+
+    def facts(self):
+        return {"name": self.name, "many": [1, 2]}
+
+    def versions(self):
+        return dict(CODE)
+
+    @cached_property
+    def inputs(self):
+        return {one.name: one for one in self.made_of}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        folder.mkdir()
+        time.sleep(self.seconds)
+        if self.name.startswith("bad"):
+            raise KeyError(self.name)
+        texts = [(root / "text").read_text() for root in inputs.values()]
+        (folder / "text").write_text(f"{self.name}({', '.join(texts)})")
+
+
+ONE, OTHER = Thing("one"), Thing("other")
+BOTH = Thing("both", (ONE, OTHER))
 
 
 @pytest.fixture
@@ -17,67 +61,139 @@ def store(tmp_path):
     return Store(tmp_path / "store")
 
 
-def make(store, artifact, seconds=0.0):
-    """Make an artefact if it is missing, and say whether it was."""
-    with store.claim([artifact]) as missing:
-        for one in missing:
-            with store.writing(one) as folder:
-                folder.mkdir()
-                time.sleep(seconds)
-                (folder / "content").write_text("made")
-        return bool(missing)
+def text(store: Store, node: Node) -> str:
+    return (store.folder(node) / "text").read_text()
 
 
 def test_a_digest_knows_content_and_no_order():
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1}) != digest({"a": 1, "b": 3})
-    assert ONE.digest != OTHER.digest
+    assert ONE == Thing("one", seconds=3) != OTHER and len({ONE, OTHER, Thing("one")}) == 2
+    assert BOTH != Thing("both", (OTHER,)) != Thing("both")
 
 
-def test_a_thing_is_made_once(store):
-    assert make(store, ONE) and not make(store, ONE) and make(store, OTHER)
-    assert json.loads((store.folder(ONE) / SPEC).read_text()) == ONE.spec
-    assert store.has(ONE) and (store.folder(ONE) / "content").read_text() == "made"
+def test_a_node_is_made_once_and_so_is_what_it_is_made_of(store):
+    folder = store.get(BOTH)
+    times = {path: path.stat().st_mtime_ns for path in store.root.glob("things/*/text")}
+    assert text(store, BOTH) == "both(one(), other())" and len(times) == 3
+    assert store.get(Thing("next", (BOTH,))) and all(path.stat().st_mtime_ns == at for path, at in times.items())
+    spec = json.loads((folder / SPEC).read_text())
+    lineage = spec.pop("lineage")
+    assert spec == BOTH.spec and lineage == {one.digest: one.spec for one in (ONE, OTHER)}
+
+
+def test_what_is_there_needs_nothing_of_what_it_was_made_of(store):
+    store.get(BOTH)
+    with store.claim([ONE]):
+        store.discard(ONE)
+    assert store.get(BOTH) and not store.has(ONE)
+    assert store.get(Thing("third", (ONE,))) and store.has(ONE)
 
 
 def test_what_two_processes_want_is_made_by_one(store):
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=make, args=(store, ONE, 0.3)) for _ in range(3)]
+    slow = Thing("slow", (replace(ONE, seconds=0.3),), seconds=0.3)
+    processes = [context.Process(target=store.get, args=(slow,)) for _ in range(3)]
     for process in processes:
         process.start()
     for process in processes:
         process.join()
-    assert [process.exitcode for process in processes] == [0, 0, 0] and store.has(ONE)
+    assert [process.exitcode for process in processes] == [0, 0, 0] and text(store, slow) == "slow(one())"
 
 
-def test_a_thing_that_is_named_twice_is_claimed_once(store):
+def test_a_node_that_is_named_twice_is_claimed_once(store):
     with store.claim([ONE, OTHER, ONE]) as missing:
         assert missing == [ONE, OTHER]
 
 
 def test_a_failure_leaves_nothing_but_its_log(store):
-    with pytest.raises(KeyError), store.claim([ONE]), store.writing(ONE) as folder:
-        folder.mkdir()
-        raise KeyError("half")
-    assert not store.has(ONE) and not list((store.root / "things").iterdir())
-    store.note(ONE, KeyError("half"))
-    assert "KeyError: 'half'" in store.log(ONE).read_text()
-    make(store, ONE)
-    assert "KeyError" in (store.folder(ONE) / LOG).read_text() and not store.log(ONE).exists()
+    bad = Thing("bad", (ONE,))
+    with pytest.raises(KeyError):
+        store.get(bad)
+    assert store.has(ONE) and not store.has(bad) and [*store.root.glob("things/*")] == [store.folder(ONE)]
+    store.note(OTHER, KeyError("half"))
+    assert "KeyError: 'half'" in store.log(OTHER).read_text()
+    store.get(OTHER)
+    assert "KeyError" in (store.folder(OTHER) / LOG).read_text() and not store.log(OTHER).exists()
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_of_several_those_that_can_be_made_are(beside, store, monkeypatch):
+    monkeypatch.setattr(module, "cores", lambda: 2)
+    good, bad = (replace(Thing(name, (ONE,)), is_single_threaded=beside) for name in ("good", "bad"))
+    lost = replace(Thing("lost", (Thing("bad input"),)), is_single_threaded=beside)
+    failed = store.get_all([good, bad, lost, good], Machine())
+    assert {one: str(error) for one, error in failed.items()} == {bad: "'bad'", lost: "'bad input'"}
+    assert text(store, good) == "good(one())"
+
+
+def test_what_is_passing_goes_with_what_it_was_for(store):
+    passing = Thing("passing", (ONE,), is_passing=True)
+    store.get(Thing("whole", (passing,)))
+    with pytest.raises(KeyError):
+        store.get(Thing("bad", (passing,)))
+    assert store.has(ONE) and not store.has(passing)
+
+
+def test_a_hundred_times_made_of_each_other_is_no_deeper_than_once(store):
+    top = ONE
+    for number in range(400):
+        top = Thing(f"{number}", (top,))
+        assert top.digest
+    store.get(replace(top))
+    assert len(top.lineage) == 400
+
+
+def test_what_is_made_of_itself_is_one_sentence(store):
+    circle = Thing("circle")
+    object.__setattr__(circle, "made_of", (circle,))
+    with pytest.raises(InputError, match="^One of the things is made of itself.$"):
+        store.get(circle)
+
+
+def test_code_that_is_edited_while_it_is_at_work_makes_nothing(store, monkeypatch):
+    node = Thing("edited")
+    assert node.digest
+    monkeypatch.setitem(CODE, "numpy", "2")
+    with pytest.raises(MachineError, match="numpy is not what it was when this began"):
+        store.get(node)
+    assert not store.has(node) and store.get(Thing("edited"))
 
 
 def test_something_else_in_its_place_is_one_sentence(store):
     folder = store.folder(ONE)
-    for content in (None, "not JSON", json.dumps({"a": 7})):
+    for content in (None, "not JSON", json.dumps({"a": 7}), json.dumps(ONE.spec | {"name": "two"})):
         folder.mkdir(parents=True, exist_ok=True)
         if content:
             (folder / SPEC).write_text(content)
         with pytest.raises(ValueError, match="move it away") as refused:
-            store.has(ONE)
+            store.get(ONE)
         assert "\n" not in str(refused.value) and str(folder) in str(refused.value)
 
 
 def test_what_is_discarded_is_made_anew(store):
-    make(store, ONE)
-    with store.claim([ONE]):
-        store.discard(ONE)
-    assert not store.has(ONE) and make(store, ONE)
+    store.get(ONE)
+    for _ in range(2):  # the second time there is nothing to discard
+        with store.claim([ONE]):
+            store.discard(ONE)
+    assert not store.has(ONE) and store.get(ONE) and store.has(ONE)
+
+
+def test_it_is_told_what_differs_from_what_was_made_before(store, monkeypatch):
+    before = json.loads((store.get(BOTH) / SPEC).read_text())
+    assert differences(before, BOTH) == []
+    assert differences(before, Thing("both", (ONE, Thing("third")))) == ["third"]
+    assert differences(before, Thing("wrong", (Thing("one", (OTHER,)), OTHER))) == ["name", "one.other"]
+    monkeypatch.setitem(CODE, "numpy", "2")
+    assert differences(before, Thing("both", (Thing("one"), Thing("other")))) == ["numpy"]
+
+
+def test_a_folder_of_a_store_tells_what_it_was_made_by(store, tmp_path, monkeypatch):
+    for name, version in (("numpy", "1"), ("constructskill.sim", "before"), ("not_installed", "1")):
+        monkeypatch.setitem(CODE, name, version)
+    folder = store.get(Thing("both", (Thing("one"),)))
+    assert {*outdated(folder)} == {"numpy", "constructskill.sim", "not_installed"}
+    with pytest.raises(MissingError, match="no folder of a store"):
+        outdated(tmp_path)
+    (folder / SPEC).write_text("{}")
+    with pytest.raises(InputError, match="versions: it is missing"):
+        outdated(folder)

@@ -17,15 +17,16 @@ from commands import OFFLINE, call
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class
 
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.dagger import rounds
-from lerobot_constructskill.dagger.merge import obtain_data, parts_of
 from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.rounds import Round
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.dataset.card import card_facts, render
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
-from lerobot_constructskill.features.trainer import FeatureTrainer, features_artifact, obtain_features
+from lerobot_constructskill.features.node import Features
+from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.parsing import parse
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -117,45 +118,43 @@ def test_killed_at_several_stages_it_ends_in_the_same_bytes(made, settings, tmp_
 
 def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, settings, tmp_path, monkeypatch):
     """The quick one of the test above: both episodes are driven, one is then damaged as a power cut may do it."""
-    plan = Plan(parse(DaggerConfig, ["--repo_id=local/driven"], settings))
+    plan = Plan.of(parse(DaggerConfig, ["--repo_id=local/driven"], settings))
     store = Store(shutil.copytree(settings.parent / "store", tmp_path / "store", symlinks=True))
     folder = store.folder(plan.round(1))
-    before, asked, drive = hashes(folder), [], rounds._drive
+    before, asked, drive = hashes(folder), [], Round._drive
     shutil.rmtree(folder)
     order = "meta/stats.json"  # LeRobot lists columns in the order of a set; the whole data set's are sorted
 
     def stop(*_):
         raise MemoryError
 
-    def note(plan, number, seeds, *others):
+    def note(self, seeds, *others):
         asked.append(list(seeds))
-        return drive(plan, number, seeds, *others)
+        return drive(self, seeds, *others)
 
-    monkeypatch.setattr(rounds, "_drive", note)
+    monkeypatch.setattr(Round, "_drive", note)
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
         patch.setattr(rounds, "aggregate", stop)
-        rounds.obtain_round(plan, 1, store)
+        store.get(plan.round(1))
     next(tmp_path.rglob(f"{asked[0][0]}/outcome.json")).write_text("")
-    rounds.obtain_round(plan, 1, store)
+    store.get(plan.round(1))
     both = list(plan.seeds(1))
     assert asked == [both, both[:1]] and hashes(folder) | {order: None} == before | {order: None}
 
 
 @pytest.mark.parametrize("readout", ["heat_maps", "spatial_softmax"])
-def test_joined_features_are_those_of_the_whole_set_encoded(readout, made, settings):
-    config = parse(DaggerConfig, ["--repo_id=local/driven"], settings)
-    plan, store = Plan(config), Store(settings.parent / "store")
-    policy = replace(plan.policy, readout=readout)
-    whole, parts = obtain_data(plan, ROUNDS, store), parts_of(plan, ROUNDS, store)
-    folder = store.folder(features_artifact(policy, whole))
-    with FeatureTrainer().joined(policy, whole, parts, store):
-        joined = hashes(folder)
-    assert not folder.exists()
-    with pytest.raises(MemoryError), FeatureTrainer().joined(policy, whole, parts, store):
-        raise MemoryError
-    assert not folder.exists()
-    obtain_features(policy, whole, store)
-    assert joined == hashes(folder)
+def test_joined_features_are_those_of_the_whole_set_encoded(readout, made, settings, tmp_path):
+    plan, store = Plan.of(parse(DaggerConfig, ["--repo_id=local/driven"], settings)), Store(settings.parent / "store")
+    config = replace(plan.learner.here, readout=readout)
+    joined = FeatureTrainer().learns_from(config, plan.data(ROUNDS))
+    assert len(joined.of_parts) == 1 + ROUNDS and not store.has(joined), "it has gone with what was trained on it"
+    whole = Features(config, plan.data(ROUNDS))
+    object.__setattr__(whole, "digest", joined.digest)  # the name of the data set, which its files hold
+    inputs = {"demonstrations": store.get(plan.data(ROUNDS))}
+    whole.make(tmp_path / "whole", inputs, Machine())
+    inputs |= {name: store.get(part) for name, part in joined.inputs.items()}
+    joined.make(tmp_path / "joined", inputs, Machine())
+    assert hashes(tmp_path / "joined") == hashes(tmp_path / "whole")
 
 
 def hashes(root):

@@ -11,7 +11,7 @@ from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.presets import find, names
-from lerobot_constructskill.study.runs import list_runs
+from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.spec import Setting, Study, Variant
 from lerobot_constructskill.training.recipe import Training
 
@@ -23,7 +23,7 @@ CONFIG = DaggerConfig("local/set", ACT, base=SEEN, rounds=3)
 
 
 def made(**fields):
-    plan = Plan(replace(CONFIG, **fields))
+    plan = Plan.of(replace(CONFIG, **fields))
     rounds = [plan.round(number).digest for number in (1, 2, 3)]
     return [plan.checkpoint(number).digest for number in range(4)], rounds
 
@@ -41,7 +41,7 @@ def test_names_places_and_how_it_is_run_change_nothing(fields):
 
 
 def test_more_rounds_go_on_where_fewer_ended():
-    assert Plan(replace(CONFIG, rounds=9)).checkpoint(3).digest == made()[0][3]
+    assert Plan.of(replace(CONFIG, rounds=9)).checkpoint(3).digest == made()[0][3]
 
 
 @pytest.mark.parametrize(
@@ -66,9 +66,9 @@ def test_another_way_to_drive_shares_the_policy_of_the_demonstrations_alone(fiel
 
 @pytest.mark.parametrize("labels, taken", [("clean", True), ("advice", True), ("executed", False)])
 def test_all_labels_are_the_experts_and_advice_if_nothing_else_is_asked_for(labels, taken):
-    assert Plan(replace(CONFIG, base="fast_executed_labels")).base.labels == "advice"
-    plan = Plan(replace(CONFIG, base=f"{SEEN} --labels={labels}"))
+    assert Plan.of(replace(CONFIG, base="fast_executed_labels")).base.config.labels == "advice"
     with nullcontext() if taken else pytest.raises(InputError, match="DAgger needs the expert's"):
+        plan = Plan.of(replace(CONFIG, base=f"{SEEN} --labels={labels}"))
         assert (plan.round(1).digest == made()[1][0]) is (labels == "advice")
 
 
@@ -78,29 +78,29 @@ def test_a_later_beta_changes_the_later_rounds_alone():
 
 
 def test_seeds_of_rounds_never_meet():
-    plan = Plan(CONFIG)
+    plan = Plan.of(CONFIG)
     seeds = [seed for number in (1, 2, 3) for seed in plan.seeds(number)]
-    assert len(set(seeds)) == 3 * CONFIG.episodes and min(seeds) > plan.base.seed_start + plan.base.episodes
+    assert len(set(seeds)) == 3 * CONFIG.episodes and min(seeds) > max(plan.base.starts)
 
 
 def test_a_hundred_rounds_are_planned_as_soon_as_three():
-    plan = Plan(replace(CONFIG, rounds=100))
+    plan = Plan.of(replace(CONFIG, rounds=100))
     assert plan.round(3).digest == made()[1][2] and len({plan.data(number).digest for number in range(101)}) == 101
 
 
 @pytest.mark.parametrize("policy, reads", [(ACT, True), (FROZEN_VIT, False), (FROZEN_VIT | {"use_state": True}, True)])
 def test_what_a_policy_reads_the_base_has_to_show(policy, reads):
-    _ = Plan(replace(CONFIG, policy=policy)).round(1)
+    _ = Plan.of(replace(CONFIG, policy=policy)).round(1)
     unseen = replace(CONFIG, policy=policy, base="smoke")
-    _ = Plan(replace(unseen, rounds=0)).checkpoint(0)
-    for drives in (lambda: Plan(unseen).round(1), lambda: Plan(replace(unseen, rounds=0)).evaluation(0)):
+    _ = Plan.of(replace(unseen, rounds=0)).checkpoint(0)
+    for drives in (lambda: Plan.of(unseen).round(1), lambda: Plan.of(replace(unseen, rounds=0)).evaluation(0)):
         with pytest.raises(InputError, match="reads observation.state") if reads else nullcontext():
             drives()
 
 
 @pytest.mark.parametrize("name", names("dagger"))
 def test_every_shipped_configuration_makes_a_plan(name):
-    plan = Plan(parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", name)))
+    plan = Plan.of(parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", name)))
     assert plan.checkpoint(plan.config.rounds).digest != plan.checkpoint(0).digest
 
 
@@ -114,7 +114,7 @@ def test_every_shipped_configuration_makes_a_plan(name):
 )
 def test_no_start_is_in_two_of_demonstrations_rounds_and_evaluation(fields):
     with pytest.raises(InputError, match="no start may be in both"):
-        _ = Plan(replace(CONFIG, **fields)).base
+        Plan.of(replace(CONFIG, **fields))
 
 
 def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives():
@@ -124,16 +124,16 @@ def test_a_studys_variant_is_trained_on_the_rounds_that_each_of_its_seeds_drives
     first, second, cloned = list_runs(study)
     config = parse(DaggerConfig, ["--repo_id=local/set"], find("dagger", "smoke"))
     for run in (first, second):
-        plan = Plan(replace(config, policy=FROZEN_VIT, training=Training(epochs=3), seed=run.seed))
-        assert run.checkpoint.digest == plan.checkpoint(config.rounds).digest
-    alone, stacked = first.dagger.checkpoint(0).spec, cloned.checkpoint.spec
-    assert stacked == alone | {"stack": 10}, "who drives is trained alone: each seed has rounds of its own"
-    assert first.checkpoint.digest != second.checkpoint.digest
+        plan = Plan.of(replace(config, policy=FROZEN_VIT, training=Training(epochs=3), seed=run.seed))
+        assert run.checkpoints == plan.checkpoint(config.rounds)
+    alone, stacked = first.plan.checkpoint(0).spec, cloned.checkpoints.spec
+    assert stacked == alone | {"seeds": [0, 10]}, "who drives is trained alone: each seed has rounds of its own"
+    assert first.checkpoints != second.checkpoints
 
 
 def test_a_studys_rounds_begin_with_the_variants_own_demonstrations():
     driven = Variant(ACT, seeds=1, data="--episodes=1", dagger="smoke --rounds=2")
     (run,) = list_runs(Study("x", {"fixed": Setting("fast", {"obs_type": "pixels_agent_pos"})}, {"driven": driven}))
-    assert (run.dagger.base.episodes, run.dagger.base.noise.sigma, run.dagger.config.rounds) == (1, 0.01, 2)
-    assert run.arm.demonstrations.name == run.dagger.config.base == "fast --episodes=1 --labels=advice"
-    assert run.arm.demonstrations.config.labels == run.dagger.base.labels == "advice"
+    base = run.plan.base.config
+    assert (base.episodes, base.noise.sigma, base.labels, run.plan.config.rounds) == (1, 0.01, "advice", 2)
+    assert run.arm.demonstrations.name == "fast --episodes=1 --labels=advice"

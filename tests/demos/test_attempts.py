@@ -14,8 +14,8 @@ from lerobot_constructskill.artifacts import disk
 from lerobot_constructskill.contract import SIM_STATE
 from lerobot_constructskill.demos import merge, recorder, shards
 from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.noise import NoiseConfig
-from lerobot_constructskill.demos.obtain import artifact
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.demos.settings import frames_digest
 from lerobot_constructskill.demos.shards import Attempt
@@ -88,14 +88,14 @@ def test_data_of_other_columns_or_another_encoder_is_other_data(monkeypatch):
     """Or what an earlier version made would count as made, and the shards that it finished be mixed with new ones."""
     config = replace(CONFIG, video="lossless", light_robot=True)
     options = VIDEOS["lossless"].encoder | {"g": 20}
-    before = frames_digest(config), artifact(config).digest
+    before = frames_digest(config), Demonstrations(config).digest
     with monkeypatch.context() as patch:
         patch.setitem(VIDEOS, "lossless", replace(VIDEOS["lossless"], encoder=options))
-        encoded = frames_digest(config), artifact(config).digest
+        encoded = frames_digest(config), Demonstrations(config).digest
     with monkeypatch.context() as patch:
         patch.delitem(SIM_STATE, "joint_velocities")
-        seen = frames_digest(config), artifact(config).digest
-    assert before == (frames_digest(config), artifact(config).digest)
+        seen = frames_digest(config), Demonstrations(config).digest
+    assert before == (frames_digest(config), Demonstrations(config).digest)
     assert all(len({*digests}) == 3 for digests in zip(before, encoded, seen, strict=True))
 
 

@@ -49,20 +49,17 @@ class LateACTConfig(ACTConfig):
 
 
 class LateTrainer(Trainer):
-    def seeds_together(self, config):
-        return True
-
-    def fit(self, config, demonstrations, writers, epochs, batch_size, held_out, store):
+    def fit(self, config, dataset, seeds, training, held_out, folder):
         import torch
         from lerobot.policies.factory import make_policy, make_pre_post_processors
 
-        for seed, write in writers.items():
+        for seed in seeds:
             torch.manual_seed(seed)
-            policy = make_policy(ACTConfig(**vars(config)), ds_meta=demonstrations.meta)
-            with write() as folder:
-                policy.save_pretrained(folder)
-                for processor in make_pre_post_processors(policy.config, dataset_stats=demonstrations.meta.stats):
-                    processor.save_pretrained(folder)
+            policy = make_policy(ACTConfig(**vars(config)), ds_meta=dataset.meta)
+            policy.save_pretrained(folder / f"seed_{seed}")
+            for processor in make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats):
+                processor.save_pretrained(folder / f"seed_{seed}")
+        return {"late": "by three steps"}
 
 
 class LateExpert(ExpertAgent):
@@ -118,7 +115,7 @@ def study_file(tmp_path_factory, tiny_weights):
 def flags(study_file):
     """The study's flags, with `<folder>/study` and `<folder>/store`."""
     file = f"--config_path={study_file}"
-    return lambda folder: [file, f"--root={folder / 'study'}", f"--store={folder / 'store'}", "--workers=1"]
+    return lambda folder: [file, f"--root={folder / 'study'}", f"--store={folder / 'store'}"]
 
 
 @pytest.fixture(scope="module")
@@ -169,11 +166,20 @@ def wait_for(process: subprocess.Popen, folder: Path, stage: str) -> None:
 @pytest.mark.nightly
 def test_killed_at_any_stage_it_ends_as_the_undisturbed_one(start, finish, undisturbed, tmp_path):
     for stage in STAGES:
-        process = start(tmp_path)
+        process = start(tmp_path, "--workers=1")
         wait_for(process, tmp_path, stage)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
     pd.testing.assert_frame_equal(finish(tmp_path), undisturbed)
+
+
+@pytest.mark.nightly
+def test_a_seed_after_another_ends_as_both_at_once(finish, undisturbed, tmp_path):
+    """Rows hold the hashes of demonstrations and weights."""
+    finish(tmp_path, "--seeds=1", "--only=fixed/tiny")
+    made = finish(tmp_path, "--only=fixed/tiny")
+    both = (rows[rows["variant"] == "tiny"].reset_index(drop=True) for rows in (made, undisturbed))
+    pd.testing.assert_frame_equal(*both)
 
 
 def test_the_rows_say_what_happened(undisturbed):

@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from errno import ENOENT, ENOSPC, ESTALE
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pandas as pd
@@ -22,9 +23,9 @@ from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.scripts.study import study as study_command
-from lerobot_constructskill.study import execute
-from lerobot_constructskill.study import run as run_module
-from lerobot_constructskill.study.execute import EPISODES, Job, _let_through, _together
+from lerobot_constructskill.study import runs as runs_module
+from lerobot_constructskill.study import session
+from lerobot_constructskill.study.plan import SEEDS_APART, list_runs
 from lerobot_constructskill.study.rows import (
     NOT_RUN,
     PROVENANCE,
@@ -35,14 +36,14 @@ from lerobot_constructskill.study.rows import (
     read_rows,
     write_rows,
 )
-from lerobot_constructskill.study.run import choose, run_study
-from lerobot_constructskill.study.runs import SEEDS_APART, list_runs
+from lerobot_constructskill.study.runs import EPISODES, Job, _without_machines
+from lerobot_constructskill.study.session import choose, run_study
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.status import status
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import EVALUATION, TIMINGS, TRAINING, seconds_by_stage, timed
-from lerobot_constructskill.study.validate import list_pairs
-from lerobot_constructskill.training.checkpoints import FACTS, writing_checkpoint
+from lerobot_constructskill.study.validate import heldout, list_pairs
+from lerobot_constructskill.training.heldout import FILE
 from lerobot_constructskill.training.recipe import Training
 
 ACT = {"type": "act", "pretrained_backbone_weights": None}
@@ -63,7 +64,7 @@ def study(**fields) -> Study:
 
 
 def digests(of: Study) -> dict[str, str]:
-    return {run.id: run.artifact.digest for run in list_runs(of)}
+    return {run.id: run.digest for run in list_runs(of)}
 
 
 def changed(before: Study, after: Study) -> set[str]:
@@ -76,12 +77,12 @@ def make_all(of: Study, root: Path) -> Table:
     """Every run is there already; the last was made first."""
     store = Store(root / "store")
     for run in reversed(list_runs(of)):
-        with store.claim([run.artifact]) as missing:
+        with store.claim([run]) as missing:
             for artifact in missing:
                 with store.writing(artifact) as folder:
                     folder.mkdir()
-                    row = EpisodeRow(run=artifact.digest, training_seed=run.seed, evaluation_seed=1000, episode=0)
-                    row = replace(row, versions=json.dumps(run.versions))
+                    row = EpisodeRow(run=run.digest, training_seed=run.seed, evaluation_seed=1000, episode=0)
+                    row = replace(row, versions=json.dumps(run.spec["versions"]))
                     write_rows([row], folder / EPISODES, EpisodeRow)
     return run_study(of, "", root / of.name, store, Options())
 
@@ -109,20 +110,11 @@ def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
         pairs = list_pairs(chosen, [run for run in runs if run not in chosen])
         return {(arm.setting, arm.name, data.name) for arm, data in pairs}
 
-    fixed = {("fixed", "own", more), ("fixed", "own", most), ("fixed", "more", own), ("fixed", "more", most)}
-    alone = {("alone", "most", "fast")}  # a set that no variant learns from
-    assert validated("") == fixed | {("fixed", "most", own), ("fixed", "most", more)} | alone
-    assert validated("fixed/most/seed_0") == set() and validated("alone") == alone
-    assert validated("fixed/own/seed_1,fixed/more") == {("fixed", "own", more), ("fixed", "more", own)}
-
-
-def test_what_dagger_makes_is_validated_on_its_demonstrations_too():
-    """Its trainer's own error is of its rounds as well, which no other variant of the setting has seen."""
-    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
-    variants = {"cloned": Variant(policy, seeds=1), "driven": Variant(policy, seeds=1, dagger="smoke")}
-    pairs = {(arm.name, data.name) for arm, data in list_pairs(list_runs(study(variants=variants)), [])}
-    others = {("driven", "smoke"), ("cloned", "smoke --labels=advice")}
-    assert pairs == others | {("driven", "smoke --labels=advice")}
+    fixed = {("fixed", name, data) for name in variants for data in (own, more, most)}
+    alone = {("alone", "most", "fast"), ("alone", "most", "fast --episodes=8")}  # no variant learns from the first
+    assert validated("") == fixed | alone
+    assert validated("fixed/most/seed_0") == {("fixed", "most", most)} and validated("alone") == alone
+    assert validated("fixed/own/seed_1,fixed/more") == {one for one in fixed if most not in one and "most" not in one}
 
 
 def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
@@ -138,17 +130,16 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
     runs = {run.id: run for run in list_runs(own)}
     assert list(runs) == [run.id for run in list_runs(shared)], "in the same order, under the same names"
     for name in ("replay", "a", "clean"):
-        starts = [run.arm.demonstrations.config.seed_start for run in runs.values() if run.arm.name == name]
+        starts = [run.arm.demonstrations.node.config.seed_start for run in runs.values() if run.arm.name == name]
         attempts = [set(range(start, start + SEEDS_APART)) for start in starts]
         assert len(set.union(*attempts)) == SEEDS_APART * len(starts)
-    bases = [runs[f"fixed/a/seed_{seed}"].arm.demonstrations.config for seed in range(3)]
-    driven = [run.dagger for run in runs.values() if run.arm.name == "driven"]
-    assert [plan.base.seed_start for plan in driven] == [base.seed_start for base in bases]
+    bases = [runs[f"fixed/a/seed_{seed}"].arm.demonstrations.node.config for seed in range(3)]
+    driven = [run.plan for run in runs.values() if run.arm.name == "driven"]
+    assert [plan.base.config.seed_start for plan in driven] == [base.seed_start for base in bases]
     assert len(set.union(*(set(plan.seeds(1)) for plan in driven))) == sum(len(plan.seeds(1)) for plan in driven)
     for seed in range(3):
         measured_on = [data for _, data in list_pairs([runs[f"fixed/a/seed_{seed}"]], [])]
-        sets = ["smoke", "smoke --noise.sigma=0", "smoke --labels=advice"]
-        names = sets[seed == 0 :]  # a trainer has measured seed 0 on its own already
+        names = ["smoke", "smoke --noise.sigma=0", "smoke --labels=advice"]
         assert [(data.name, data.moved) for data in measured_on] == [(name, 0) for name in names]
     with pytest.raises(InputError, match="may take 2,002 attempts"):
         list_runs(study(settings={"fixed": Setting("smoke --episodes=1001", ENV)}, demonstrations="own"))
@@ -158,21 +149,34 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
         list_runs(study(variants=often, demonstrations="own"))
 
 
-@pytest.mark.parametrize(("demonstrations", "at_once"), [("shared", [3]), ("own", [1, 1, 1])])
+@pytest.mark.parametrize(("demonstrations", "computations"), [("shared", 1), ("own", 3)])
 def test_a_variants_seeds_are_evaluated_in_one_pass_and_trained_in_one_if_their_data_are_the_same(
-    demonstrations, at_once, tmp_path, monkeypatch
+    demonstrations, computations, tmp_path, monkeypatch
 ):
     policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
     variants = {"a": Variant(policy, seeds=3), "driven": Variant(policy, seeds=3, dagger="smoke")}
     jobs = []
-    monkeypatch.setattr("lerobot_constructskill.study.run.make_runs", lambda job: jobs.append(job) or job.runs)
-    monkeypatch.setattr("lerobot_constructskill.study.run.validate", lambda *_: None)
+    monkeypatch.setattr("lerobot_constructskill.study.session.make_runs", lambda job: jobs.append(job) or job.runs)
+    monkeypatch.setattr("lerobot_constructskill.study.session.validate", lambda *_: None)
     one = study(variants=variants, references={}, demonstrations=demonstrations)
     run_study(one, "", tmp_path / "x", Store(tmp_path / "store"), Options())
     together = [[run.id for run in job.runs] for job in jobs]
     assert together == [[f"fixed/{name}/seed_{seed}" for seed in range(3)] for name in variants]
-    trained = [[len(runs) for runs in _together(job.runs)] for job in jobs]
-    assert trained == [at_once, [1, 1, 1]], "each seed drives rounds of its own"
+    trained = [{run.checkpoints for run in job.runs} for job in jobs]
+    assert [len(nodes) for nodes in trained] == [computations, 3], "each seed drives rounds of its own"
+    assert {len(node.seeds) for node in trained[0]} == ({10} if computations == 1 else {1, 10})
+
+
+def test_what_is_computed_together_does_not_depend_on_what_is_asked_for(tmp_path):
+    """Ten seeds are one computation, of 3, of 10 or of 30, in one piece or in several."""
+    vit = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    three, ten, thirty = (list_runs(study(variants={"a": Variant(vit, seeds=n)}, references={})) for n in (3, 10, 30))
+    assert {run.checkpoints for run in three} == {run.checkpoints for run in ten} < {run.checkpoints for run in thirty}
+    assert [list(node.seeds) for node in dict.fromkeys(run.checkpoints for run in thirty)] == [
+        list(range(first, first + 10)) for first in (0, 10, 20)
+    ]
+    learning = list_runs(study(variants={"a": Variant(vit | {"readout": "attention"}, seeds=3)}, references={}))
+    assert [list(run.checkpoints.seeds) for run in learning] == [[0], [1], [2]]
 
 
 def test_names_labels_and_how_a_study_is_run_change_no_run():
@@ -201,9 +205,9 @@ def test_names_labels_and_how_a_study_is_run_change_no_run():
 )
 def test_another_evaluation_is_another_run_of_the_same_checkpoint(fields):
     before, after = list_runs(study()), list_runs(study(**fields))
-    assert not {run.artifact.digest for run in before} & {run.artifact.digest for run in after}
+    assert not {run.digest for run in before} & {run.digest for run in after}
     for one, other in zip(before, after, strict=True):
-        assert (one.checkpoint and one.checkpoint.digest) == (other.checkpoint and other.checkpoint.digest)
+        assert (one.checkpoints and one.checkpoints.digest) == (other.checkpoints and other.checkpoints.digest)
 
 
 @pytest.mark.parametrize(
@@ -341,8 +345,8 @@ def test_going_on_with_a_published_study_adds_to_its_provenance(tmp_path, monkey
         (root / TIMINGS).write_text('{"stage": "evaluation", "seconds": 5}\n')
         yield from job.runs
 
-    monkeypatch.setattr("lerobot_constructskill.study.run.make_runs", make_one)
-    monkeypatch.setattr("lerobot_constructskill.study.run.validate", lambda *_: None)
+    monkeypatch.setattr("lerobot_constructskill.study.session.make_runs", make_one)
+    monkeypatch.setattr("lerobot_constructskill.study.session.validate", lambda *_: None)
     run_study(study(variants={"a": Variant(ACT, seeds=1)}, references={}), "", root, Store(tmp_path / "s"), Options())
     facts = json.loads((root / PROVENANCE).read_text())
     assert facts["wall time, s"] >= 2000 and facts[stage] == 705 and facts["beside it"] == "tests"
@@ -354,8 +358,8 @@ def test_going_on_with_a_published_study_adds_to_its_provenance(tmp_path, monkey
 def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
     table = make_all(study(), tmp_path)
     row = {"evaluation_seed": 1000, "episode": 0, "error_kind": "weights", "error": "none here"}
-    failed = [EpisodeRow(run=run.artifact.digest, training_seed=run.seed, **row) for run in table.runs[:1]]
-    write_rows(failed, table.store.folder(table.runs[0].artifact) / EPISODES, EpisodeRow)
+    failed = [EpisodeRow(run=run.digest, training_seed=run.seed, **row) for run in table.runs[:1]]
+    write_rows(failed, table.store.folder(table.runs[0]) / EPISODES, EpisodeRow)
     (tmp_path / "x" / "rows.parquet").unlink()
     Table(tmp_path / "x", table.runs, table.store).write()
     published = read_rows(tmp_path / "x" / "rows.parquet")
@@ -379,17 +383,6 @@ def test_a_torn_line_of_times_is_left_out(tmp_path):
     assert seconds_by_stage(tmp_path) == {"encoding": 0.0, "evaluation": 0.0}
 
 
-def test_rounds_of_dagger_have_the_studys_workers(tmp_path, monkeypatch):
-    """What makes the checkpoint is left out."""
-    plans = []
-    monkeypatch.setattr(execute, "make_checkpoint", lambda plan, rounds, store: plans.append(plan))
-    driven = Variant({"type": "frozen_vit", "backbone": "dinov2_vits14"}, seeds=2, dagger="smoke")
-    runs = [run for run in list_runs(study(variants={"driven": driven})) if run.arm.name == "driven"]
-    execute._fit(Job(tuple(runs), Store(tmp_path / "store"), tmp_path, workers=7), runs)
-    assert [(plan.config.workers, plan.base.workers, plan.config.seed) for plan in plans] == [(7, 7, 0), (7, 7, 1)]
-    assert [plan.checkpoint(0).digest for plan in plans] == [run.dagger.checkpoint(0).digest for run in runs]
-
-
 def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
     policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
     driven = Variant(policy, seeds=1, dagger="smoke")
@@ -410,14 +403,17 @@ def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_pa
 
 def test_held_out_errors_outlive_the_checkpoint_that_they_are_of(tmp_path):
     table = make_all(study(), tmp_path)
-    run = next(run for run in table.runs if run.checkpoint)
-    with table.store.writing(run.checkpoint) as folder:
+    run = next(run for run in table.runs if run.checkpoints)
+    with table.store.writing(run.checkpoints) as folder:
         folder.mkdir()
-        (folder / FACTS).write_text(json.dumps({"heldout_mse_m2": 1e-5}))
+    error = heldout(run, run.arm.validated_on[0])
+    with table.store.writing(error) as folder:
+        folder.mkdir()
+        (folder / FILE).write_text(json.dumps({"mse_m2": 1e-5}))
     Table(tmp_path / "x", table.runs, table.store).write()
     before = read_rows(tmp_path / "x" / "rows.parquet")
     assert set(before["heldout_mse_m2"].dropna()) == {1e-5}
-    shutil.rmtree(table.store.folder(run.checkpoint))
+    shutil.rmtree(table.store.folder(run.checkpoints))
     Table(tmp_path / "x", table.runs, table.store).write()
     pd.testing.assert_frame_equal(read_rows(tmp_path / "x" / "rows.parquet"), before)
 
@@ -439,7 +435,7 @@ def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_pa
     published = read_rows(tmp_path / "x" / "rows.parquet")
     run, mine = table.runs[0], Store(tmp_path / "mine")
     failed = replace(table.episodes(run)[0], error_kind="fault", error="RuntimeError: ours")
-    with mine.writing(run.artifact) as folder:
+    with mine.writing(run) as folder:
         folder.mkdir()
         write_rows([failed], folder / EPISODES, EpisodeRow)
     Table(tmp_path / "x", table.runs, mine).write()
@@ -463,10 +459,10 @@ def test_what_a_machine_lacks_for_one_job_leaves_the_others_alone(tmp_path, monk
             raise MachineError("out of memory")
         return job.runs
 
-    monkeypatch.setattr(run_module, "make_runs", make)
+    monkeypatch.setattr(session, "make_runs", make)
     made = []
     with pytest.raises(MachineError, match="out of memory"):
-        made.extend(run_module._execute(run_module._jobs(list_runs(study()), tmp_path, None, Options()), Options()))
+        made.extend(session._execute(session._jobs(list_runs(study()), tmp_path, None, Options()), Options()))
     assert {run.arm.name for run in made} == {"no_op", "replay", "b"}
 
 
@@ -501,8 +497,8 @@ def test_an_edited_plugin_is_told_and_its_runs_are_made_again_in_the_same_folder
     assert f"fixed/a: 0 finished, 0 failed, 3 missing (3 made before with another {THEIRS})" in said
     assert {"fixed/no_op: 1 finished, 0 failed, 0 missing", "fixed/replay: 1 finished, 0 failed, 0 missing"} <= {*said}
     made = []
-    monkeypatch.setattr(run_module, "make_runs", lambda job: made.extend(job.runs) or ())
-    monkeypatch.setattr(run_module, "validate", lambda *_: None)
+    monkeypatch.setattr(session, "make_runs", lambda job: made.extend(job.runs) or ())
+    monkeypatch.setattr(session, "validate", lambda *_: None)
     run_study(study(), "", tmp_path / "x", table.store, Options())  # what would be lost is in the store
     assert [run.id for run in made] == [run.id for run in again.missing()]
     edit("source a")
@@ -518,14 +514,14 @@ def test_other_fields_of_a_study_are_told_by_their_places(tmp_path):
 
 def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, edit):
     run = list_runs(study())[-1]
-    store, digest = Store(tmp_path), run.artifact.digest
+    store, digest = Store(tmp_path), run.digest
     refused = pytest.raises(MachineError, match=rf"{THEIRS} is not what it was when this began: it was edited, or")
-    with refused, writing_checkpoint(store, run.checkpoint, run.arm.policy) as folder:
+    with refused, store.writing(run.checkpoints) as folder:
         folder.mkdir()
         edit("source b")
     with refused:
-        execute._write_failed(Job((run,), store, tmp_path), run, ValueError("of a half-written line"))
-    assert not store.has(run.checkpoint) and not store.has(run.artifact) and run.artifact.digest == digest
+        runs_module._write_failed(Job((run,), store, tmp_path), run, ValueError("of a half-written line"))
+    assert not store.has(run.checkpoints) and not store.has(run) and run.digest == digest
 
 
 def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
@@ -546,7 +542,7 @@ def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_ta
         "    to make: seed 1, about 3 min",
         "To make: 1 run, about 3 min; first the demonstrations: smoke",
     ]
-    with table.store.writing(runs[2].checkpoint) as folder:
+    with table.store.writing(runs[2].checkpoints) as folder:
         folder.mkdir()
     assert "seed 0, about 2 min" in status(table, choose(runs, "fixed/a/seed_0"))
 
@@ -560,7 +556,7 @@ def test_the_status_of_a_misspelt_part_is_refused(tmp_path):
 
 def test_runs_that_are_something_else_are_one_sentence(tmp_path):
     table = make_all(study(), tmp_path)
-    folder = table.store.folder(table.runs[-1].artifact)
+    folder = table.store.folder(table.runs[-1])
     (folder / EPISODES).unlink()
     with pytest.raises(InputError, match="has no episodes"):
         make_all(study(), tmp_path)
@@ -594,9 +590,9 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         references={"blind": 1, "untrained": 1},
     )
     blind, untrained, _, seeing = list_runs(of)
-    assert blind.arm.policy == replace(seeing.arm.policy, blind=True)
+    assert blind.arm.learner.config == replace(seeing.arm.learner.config, blind=True)
     assert blind.arm.training == untrained.arm.training == Training(epochs=2)
-    assert not untrained.arm.policy.backbone_pretrained and seeing.arm.policy.backbone_pretrained
+    assert not untrained.arm.learner.config.backbone_pretrained and seeing.arm.learner.config.backbone_pretrained
     with pytest.raises(InputError, match="'blind' needs a variant whose policy has blind"):
         list_runs(study(references={"blind": 1}))
     two = {"fixed": Setting("smoke", ENV), "pixels": Setting("smoke", {"episode_length": 8})}
@@ -605,7 +601,7 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         "noisy": Variant(tiny, 1, data="--noise.sigma=0.02", settings=["pixels"]),
     }
     stateful, _, noisy, shown = list_runs(study(settings=two, variants=own, references={"blind": 1}))
-    assert stateful.arm.policy.use_state and not noisy.arm.policy.use_state
+    assert stateful.arm.learner.config.use_state and not noisy.arm.learner.config.use_state
     assert noisy.arm.demonstrations == shown.arm.demonstrations, "it differs in its eyes alone"
 
 
@@ -739,13 +735,13 @@ def test_what_the_machine_lacks_is_no_result_of_a_run_until_it_comes_back_each_t
     run = list_runs(study())[0]
     job = Job((run,), Store(tmp_path), tmp_path)
     if not is_the_machines:
-        assert _let_through(job, [run], error) is error
+        assert _without_machines(job, {run: error}) == {run: error}
         return
-    for _ in range(execute.TRIES - 1):
+    for _ in range(runs_module.TRIES - 1):
         with pytest.raises(type(error)):
-            _let_through(job, [run], error)
-    assert kind_of(_let_through(job, [run], error)) == "machine"
-    assert job.store.log(run.artifact).read_text().count(str(error)) >= execute.TRIES - 1
+            _without_machines(job, {run: error})
+    assert kind_of(_without_machines(job, {run: error})[run]) == "machine"
+    assert job.store.log(run).read_text().count(str(error)) >= runs_module.TRIES - 1
 
 
 @pytest.mark.parametrize(
@@ -759,7 +755,9 @@ def test_what_the_machine_lacks_is_no_result_of_a_run_until_it_comes_back_each_t
 )
 def test_a_row_names_the_graphics_card_where_it_used_one(device, backend, card, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda which: f"card {which}")
-    assert execute._made_on(device, backend) == {"processor": processor()} | ({"card": card} if card else {})
+    learner = device and SimpleNamespace(places={"device": device})
+    run = SimpleNamespace(arm=SimpleNamespace(learner=learner))
+    assert runs_module._made_on(run, backend) == {"processor": processor()} | ({"card": card} if card else {})
 
 
 EDITS = {
@@ -771,7 +769,7 @@ EDITS = {
     "policies/frozen_vit/readouts.py": ("policy", "POINT_SCALE = 8.0", "POINT_SCALE = 9.0"),
     "features/encode.py": ("policy", "import numpy as np\n", "import numpy as np\n\nBATCHES = 2\n"),
     "rollout/lockstep.py": ("episodes", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
-    "study/execute.py": ("runs", "FILMED_SEED = 0", "FILMED_SEED = 1"),
+    "study/runs.py": ("runs", "FILMED_SEED = 0", "FILMED_SEED = 1"),
     "dagger/wheel.py": ("nothing", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
     "study/table.py": ("nothing", "HELDOUT = ", "HELD = "),
     "analysis/report/wording.py": ("nothing", '"""', '"""Said otherwise. '),
@@ -783,12 +781,14 @@ def everything_of(study: Study) -> dict[str, str]:
     """Digests of all that a study makes, by what it is."""
     found = {}
     for run in list_runs(study):
-        found[f"runs/{run.arm.name}"] = run.artifact.digest
+        found[f"runs/{run.arm.name}"] = run.digest
         if run.arm.demonstrations:
-            found["demonstrations"] = run.arm.demonstrations.artifact.digest
-        if run.checkpoint:
-            found[f"checkpoints/{run.arm.name}"] = run.checkpoint.digest
-            found[f"heldout/{run.arm.name}"] = run.heldout(run.arm.demonstrations).digest
+            found["demonstrations"] = run.arm.demonstrations.node.digest
+        if run.checkpoints:
+            found[f"checkpoints/{run.arm.name}"] = run.checkpoints.digest
+            found[f"heldout/{run.arm.name}"] = heldout(run, run.arm.demonstrations).digest
+            data = run.checkpoints.inputs["data"]
+            found |= {f"features/{run.arm.name}": data.digest} if data.kind == "features" else {}
     return found
 
 
@@ -807,9 +807,9 @@ def test_an_edited_line_of_ours_makes_exactly_what_depends_on_it_stale(file, cop
     trained = {f"{kind}/{name}" for kind in ("runs", "checkpoints", "heldout") for name in variants}
     stale = {
         "everything": {*before},
-        "demonstrations": {"demonstrations", *trained, "runs/replay", "runs/expert"},
+        "demonstrations": {"demonstrations", "features/vit", *trained, "runs/replay", "runs/expert"},
         "training": trained,
-        "policy": {"runs/vit", "checkpoints/vit", "heldout/vit"},
+        "policy": {"runs/vit", "checkpoints/vit", "heldout/vit", "features/vit"},
         "episodes": {name for name in before if name.startswith(("runs", "heldout"))},
         "runs": {name for name in before if name.startswith("runs")},
         "nothing": set(),

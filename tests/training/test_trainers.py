@@ -6,15 +6,41 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_constructskill.artifacts import disk
-from lerobot_constructskill.artifacts.store import Artifact, Store
+from lerobot_constructskill.artifacts.store import Node, Store
 from lerobot_constructskill.errors import InputError, MachineError
-from lerobot_constructskill.training.checkpoints import check_inputs, writing_checkpoint
+from lerobot_constructskill.training import trainers
+from lerobot_constructskill.training.checkpoints import Checkpoints, check_inputs
 from lerobot_constructskill.training.lerobot_train import LOG, _call
-from lerobot_constructskill.training.trainers import Trainer, policy_spec
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import Learner, Trainer
+
+ACT = {"type": "act", "pretrained_backbone_weights": None}
+
+
+class Written(Node):
+    """A LeRobotDataset of a few numbers."""
+
+    kind = "demonstrations"
+
+    def facts(self):
+        return {}
+
+    def versions(self):
+        return {}
+
+    def make(self, folder, inputs, machine):
+        features = {"action": {"dtype": "float32", "shape": (4,), "names": None}}
+        dataset = LeRobotDataset.create(f"local/{self.digest}", 20, features, folder, use_videos=False)
+        for _ in range(2):
+            dataset.add_frame({"action": np.zeros(4, dtype=np.float32), "task": "t"})
+            dataset.save_episode()
+        dataset.finalize()
 
 
 def run(code: str, folder: Path) -> None:
@@ -70,16 +96,22 @@ def test_what_a_training_prints_is_on_the_disk_while_it_runs(tmp_path):
     run(f"print('begun', flush=True); assert open({str(tmp_path / LOG)!r}).read() == 'begun\\n'", tmp_path)
 
 
-def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, monkeypatch):
-    """Stands in for the disk: a real one would have to be filled."""
-    store, made = Store(tmp_path), Artifact("checkpoints", {"of": "a policy", "versions": {}})
-    full = pytest.raises(MachineError, match="is full")
-    with store.claim([made]), full, writing_checkpoint(store, made, ACTConfig(device="cpu")) as folder:
-        folder.mkdir()
-        monkeypatch.setattr(disk.shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
+class Full(Trainer):
+    """A trainer whose disk is full. It stands in for the disk: a real one would have to be filled."""
+
+    def fit(self, config, dataset, seeds, training, held_out, folder):
+        disk.shutil.disk_usage = lambda path: SimpleNamespace(free=0)
         raise RuntimeError("SafetensorError: os error 28")
+
+
+def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(disk.shutil, "disk_usage", disk.shutil.disk_usage)
+    monkeypatch.setattr(trainers, "trainer_of", lambda config: Full())
+    made = Checkpoints.holding(0, Learner.of(ACT), Training(holdout=2), Written())
+    with pytest.raises(MachineError, match="is full"):
+        Store(tmp_path).get(made)
     monkeypatch.undo()
-    assert not store.has(made)
+    assert not Store(tmp_path).has(made)
 
 
 ALL_THREADS_FLUSH = """
@@ -100,7 +132,7 @@ main()
 @pytest.mark.parametrize(
     ("command", "module", "first", "flags"),
     [
-        ("study", "study.run", "make_runs", ["smoke", "--root=study"]),
+        ("study", "study.session", "make_runs", ["smoke", "--root=study"]),
         ("dagger", "dagger.run", "_lines", ["smoke", "--root=dagger", "--repo_id=local/driven"]),
     ],
 )
@@ -116,8 +148,17 @@ def test_a_policy_of_others_that_names_no_inputs_is_not_taken_to_read_the_state(
         check_inputs(ACTConfig(), "pixels")
 
 
-def test_a_gpus_checkpoint_is_another_and_a_studys_rows_of_a_cpu_are_found_beside_a_gpu():
+def test_a_gpus_checkpoint_is_another_and_a_studys_rows_of_a_cpu_are_found_beside_a_gpu(monkeypatch):
     here, there = ACTConfig(device="cpu"), ACTConfig(device="cpu")
     there.device = "cuda:1"  # as on a machine that has one: LeRobot takes the CPU here
-    assert policy_spec(here)["device"] == "cpu" and policy_spec(there) == policy_spec(here) | {"device": "cuda"}
-    assert Trainer().settled_elsewhere(here) == [] and Trainer().settled_elsewhere(there) == [{"device": "cpu"}]
+    monkeypatch.setattr(trainers, "decode_policy", lambda config: config)
+    one, other = Learner.of(here), Learner.of(there)
+    assert one.facts()["device"] == "cpu" and other.facts() == one.facts() | {"device": "cuda"}
+    assert one.elsewhere == () and [each.facts() for each in other.elsewhere] == [one.facts()]
+    assert other.here.device == "cuda:1" and other.acting == {"device": "cuda:1"}
+
+
+def test_where_a_policy_is_published_and_how_it_is_labelled_is_none_of_its_checkpoints():
+    published = ACT | {"push_to_hub": True, "repo_id": "someone/act", "tags": ["x"], "license": "mit"}
+    assert Learner.of(published).facts() == Learner.of(ACT).facts()
+    assert Learner.of(published).here.repo_id == "someone/act"

@@ -16,13 +16,13 @@ from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.artifacts.pools import cores, open_pool
 from lerobot_constructskill.artifacts.processor import processor
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.study.execute import Job, make_runs
+from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY
-from lerobot_constructskill.study.runs import Run, list_runs
+from lerobot_constructskill.study.runs import Job, Run, make_runs
 from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import seconds_by_stage
@@ -57,7 +57,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         missing = [run for run in chosen if table.episodes(run) is None]
         for run in chosen:
             if run not in missing:
-                with store.claim([run.artifact]):  # one by one: each holds a file open
+                with store.claim([run]):  # one by one: each holds a file open
                     pass  # which tidies up after a process that was killed when it was whole
         table.write()
         earlier, before, start = _provenance(root), seconds_by_stage(root), time.monotonic()
@@ -67,7 +67,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
                 _write_provenance(root, earlier, before, time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
-        validate(chosen, [run for run in runs if run not in chosen], store, options.workers)
+        validate(chosen, [run for run in runs if run not in chosen], store, Machine(options.workers))
         table.write_anew()
         return table
 
@@ -97,10 +97,11 @@ def choose(runs: Sequence[Run], only: str) -> list[Run]:
 
 def _jobs(missing: Sequence[Run], root: Path, store: Store, options: Options) -> Iterator[Job]:
     simulators = max(1, cores() // options.workers) if options.executor == "ray" else None  # jobs share the cores
-    different = {run.artifact.digest: run for run in missing}.values()  # two names may be of one thing
-    for _, seeds in groupby(different, key=lambda run: (run.arm.setting, run.arm.name)):
+    machine = Machine(options.workers, simulators)
+    different = dict.fromkeys(missing)  # two names may be of one thing
+    for _, seeds in groupby(different, key=lambda run: run.arm.id):
         for some in batched(seeds, options.together):  # noqa: B911  the last one may be shorter
-            yield Job(some, store, root, options.workers, simulators)
+            yield Job(some, store, root, machine)
 
 
 def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
@@ -127,7 +128,9 @@ def _noted(stopped: list[Exception]) -> Iterator[None]:
     try:
         yield
     except (OSError, MemoryError, RuntimeError) as error:
-        logger.warning("The other runs go on; these wait for the same command: %s", " ".join(str(error).split()))
+        logger.warning(
+            "Machine error; these runs are skipped, and the same command makes them: %s", " ".join(str(error).split())
+        )
         stopped.append(error)
 
 

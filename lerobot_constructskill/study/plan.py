@@ -1,0 +1,176 @@
+"""From a study to its runs: all that a run depends on is read, checked and written out before anything runs."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import Any
+
+from lerobot.envs import EnvConfig
+
+from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.dagger.plan import Plan
+from lerobot_constructskill.dagger.settings import DaggerConfig
+from lerobot_constructskill.demos.node import Demonstrations
+from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
+from lerobot_constructskill.envs.gym_env import resolve_rendering
+from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.parsing import decode, parse_named
+from lerobot_constructskill.policy_types import decode_policy
+from lerobot_constructskill.rollout.references import REFERENCES, Reference
+from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
+from lerobot_constructskill.study.runs import Arm, DataSet, Run
+from lerobot_constructskill.study.spec import SHARED, Study, Variant
+from lerobot_constructskill.training.checkpoints import check_inputs
+from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.trainers import Learner
+
+OURS = "constructskill"
+"""The one environment that a study evaluates in."""
+
+SEEDS_APART = 2_000
+"""From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
+
+
+def list_runs(study: Study) -> list[Run]:
+    """Every run of a study: the references of each setting, then its variants, in the study's order.
+
+    Raises:
+        InputError: a field, anywhere in the study, that nothing can be run with; the message names it.
+    """
+    runs = []
+    for name, setting in study.settings.items():
+        with _inside(f"settings.{name}.env"):
+            env = resolve_env(setting.env)
+        sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
+        evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
+        starts = range(study.eval_seed, study.eval_seed + study.episodes)
+        for data in sets.values():
+            check_apart({f"demonstrations '{data.name}'": data.node.starts, "evaluation": starts})
+        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
+        for reference, count in study.references.items():
+            for seeds, drawn in _draws(study, range(count), sets):
+                arm = _reference_arm(study, reference, drawn, common)
+                runs += [Run(arm, seed) for seed in seeds]
+        for variant_name, variant in study.variants_in(name).items():
+            for seeds, drawn in _draws(study, variant.training_seeds, sets):
+                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], common)
+                runs += [Run(arm, seed) for seed in seeds]
+    return runs
+
+
+def _draws(study: Study, seeds: range, sets: dict[str, DataSet]) -> Iterator[tuple[Sequence[int], dict[str, DataSet]]]:
+    """Training seeds, and the demonstrations of a setting that they all learn from."""
+    if study.demonstrations == SHARED:
+        yield seeds, sets
+        return
+    for seed in seeds:
+        yield [seed], {name: _drawn_for(seed, one) for name, one in sets.items()}
+
+
+def _drawn_for(seed: int, data: DataSet) -> DataSet:
+    """A training seed's own draw of some demonstrations; seed 0 has those that all seeds would share.
+
+    Raises:
+        InputError: two draws could have attempts in common.
+    """
+    config = data.node.config
+    attempts = config.episodes * (1 + config.max_failures)
+    if attempts > SEEDS_APART:
+        raise InputError(
+            f"{data.name} may take {attempts:,.0f} attempts; of demonstrations that each training seed has of its "
+            f"own, none may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
+        )
+    moved = seed * SEEDS_APART
+    return DataSet(data.name, Demonstrations(replace(config, seed_start=config.seed_start + moved)), moved)
+
+
+def _variant_arm(study: Study, name: str, variant: Variant, data: DataSet, common: Mapping[str, Any]) -> Arm:
+    with _inside(f"variants.{name}.policy"):
+        learner = Learner.of(variant.policy)
+        check_inputs(learner.config, common["env"]["obs_type"])
+    first, starts = study.eval_seed, {"demonstrations": data.node.starts}
+    starts["evaluation"] = range(first, first + study.episodes)
+    rounds = _rounds(study, name, variant, data) if variant.dagger else None
+    training = _training_of(study, common["setting"], name, variant)
+    with _inside(f"variants.{name}"):
+        check_apart(starts | ({"rounds": rounds.starts} if rounds else {}))
+        if rounds:
+            Plan(rounds, data.node, learner, training, variant.first_seed)  # which refuses what cannot be driven
+    return Arm(
+        name=name, role=VARIANT, demonstrations=data, learner=learner, training=training, rounds=rounds, **common
+    )
+
+
+def _rounds(study: Study, name: str, variant: Variant, data: DataSet) -> DaggerConfig:
+    """The rounds of a variant, which begin elsewhere where its demonstrations do."""
+    with _inside(f"dagger {variant.dagger}"):
+        rounds = parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
+    if len(rounds.starts) > SEEDS_APART and study.demonstrations != SHARED:
+        raise InputError(
+            f"variants.{name}.dagger: where each training seed has demonstrations of its own, all rounds together "
+            f"may have {SEEDS_APART:,} episodes at most, not {len(rounds.starts):,}."
+        )
+    return replace(rounds, seed_start=rounds.seed_start + data.moved)
+
+
+def _reference_arm(study: Study, name: str, sets: Mapping[str, DataSet], common: Mapping[str, Any]) -> Arm:
+    if name not in REFERENCES:
+        raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
+    reference, setting = REFERENCES[name], common["setting"]
+    role = REFERENCE if reference.looks else SIGHTLESS
+    if reference.policy:
+        base, variant = _variant_with(study, name, reference, setting)
+        with _inside(f"references.{name}"):
+            learner = Learner.of({**variant.policy, **reference.policy})
+            check_inputs(learner.config, common["env"]["obs_type"])
+        training = _training_of(study, setting, base, variant)
+        data = sets[study.data_for(setting, variant)]
+        return Arm(name=name, role=role, demonstrations=data, learner=learner, training=training, **common)
+    data = sets[study.settings[setting].data] if reference.reads_demonstrations else None
+    return Arm(name=name, role=role, demonstrations=data, **common | {"validated_on": ()})
+
+
+def _variant_with(study: Study, name: str, reference: Reference, setting: str) -> tuple[str, Variant]:
+    """The first variant in a setting, none of DAgger's, whose policy has the fields that a reference sets."""
+    for of_variant, variant in study.variants_in(setting).items():
+        if variant.dagger:
+            continue
+        with _inside(f"variants.{of_variant}.policy"):
+            kind = type(decode_policy(variant.policy))
+        if all(hasattr(kind, field) for field in reference.policy):
+            return of_variant, variant
+    fields = ", ".join(reference.policy)
+    raise InputError(f"The reference '{name}' needs a variant whose policy has {fields}, as frozen_vit has.")
+
+
+def _training_of(study: Study, setting: str, name: str, variant: Variant) -> Training:
+    with _inside(f"settings.{setting}.training"):
+        training = decode(Training, {**asdict(study.training), **study.settings[setting].training})
+    with _inside(f"variants.{name}.training"):
+        return decode(Training, {**asdict(training), **variant.training})
+
+
+def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Every keyword of the environment, with whatever it leaves to the task and the machine written out."""
+    if fields.get("type", OURS) != OURS:
+        raise InputError(f"type must be {OURS}, not {fields['type']!a}: a study evaluates in no other environment.")
+    env = decode(EnvConfig, {**fields, "type": OURS}).gym_kwargs
+    task = get_task(env["task"])  # one: a setting is no suite
+    length = env["episode_length"] or task.horizon
+    light_robot, backend = resolve_rendering(env["light_robot"], env["render_backend"])
+    return env | {"episode_length": length, "light_robot": light_robot, "render_backend": backend}
+
+
+def _read_demonstrations(setting: str, data: str) -> DataSet:
+    with _inside(f"settings.{setting}, data {data}"):
+        config = parse_named(GenerateConfig, "generate", data, ["--repo_id=local/any"])
+    return DataSet(data, Demonstrations(config))
+
+
+@contextmanager
+def _inside(where: str) -> Iterator[None]:
+    """Say in which part of the study a field lies that cannot be used."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(f"{where}: {error}") from error

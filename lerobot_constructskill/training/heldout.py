@@ -1,0 +1,58 @@
+"""The held-out error of a checkpoint on some demonstrations, as a node of a store."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.files import Json
+from lerobot_constructskill.rollout.heldout import heldout_mse
+from lerobot_constructskill.training.checkpoints import Checkpoints, checkpoint_of
+
+FILE = "heldout.json"
+
+ERROR = Json("a held-out error", dict[str, float | None])
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutError(Node):
+    """The translation error of a training seed's policy on the episodes of some demonstrations that are held out."""
+
+    checkpoints: Checkpoints
+    seed: int
+    demonstrations: Node
+
+    kind = "heldout"
+
+    def facts(self) -> dict[str, Any]:
+        return {"seed": self.seed, "holdout": self.checkpoints.training.holdout}
+
+    def versions(self) -> dict[str, str]:
+        return code_of(__name__, heldout_mse.__module__)
+
+    @cached_property
+    def inputs(self) -> dict[str, Node]:
+        learner = self.checkpoints.learner
+        data = learner.trainer.learns_from(learner.here, self.demonstrations)
+        return {"checkpoint": self.checkpoints, "data": data}
+
+    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
+        """Measure the error. Raises as `rollout.heldout.heldout_mse` does."""
+        dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
+        episodes = held_out(dataset.num_episodes, self.checkpoints.training.holdout)
+        checkpoint = checkpoint_of(self.seed, inputs["checkpoint"])
+        error = heldout_mse(checkpoint, dataset, episodes, **self.checkpoints.learner.acting)
+        folder.mkdir()
+        (folder / FILE).write_text(json.dumps({"mse_m2": error}) + "\n", encoding="utf-8")
+
+
+def read_error(folder: Path) -> float | None:
+    """The error in m2 in the folder of a `HeldOutError`; None where no episode was held out."""
+    return ERROR.read(folder / FILE)["mse_m2"]
