@@ -60,10 +60,12 @@ def outdated(folder: Path) -> list[str]:
         raise MissingError(f"'{folder}' is no folder of a store: it has no {SPEC}.")
     spec = SPECIFICATION.read(folder / SPEC)
     before = dict(pair for one in (spec, *spec.get(LINEAGE, {}).values()) for pair in one[VERSIONS].items())
-    return versions_that_differ(before, {name: _code_now(name) for name in before})
+    return versions_that_differ(before, {name: _code_now(name, told) for name, told in before.items()})
 
 
-def _code_now(name: str) -> str | None:
-    """The version of a package, the revision of a room, or the source of another's package."""
-    room = read_table().get(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else None
-    return revision(room) if room else code_of(name).get(name) or installed(name)
+def _code_now(name: str, before: str) -> str | None:
+    """The revision of a room, the version of a package, or its version and source where these were told before."""
+    if name.startswith(PREFIX):
+        room = read_table().get(name.removeprefix(PREFIX))
+        return room and revision(room)
+    return code_of(name).get(name) if "source " in before else installed(name)
