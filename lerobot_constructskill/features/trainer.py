@@ -28,7 +28,7 @@ from lerobot_constructskill.features.encode import (
 )
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import close_patches, describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.feature_sets import close_patches, describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, resolve_precision
@@ -50,7 +50,7 @@ STACK = 10
 class FeatureTrainer:
     """`training.trainers.Trainer` of frozen_vit."""
 
-    places = ("backbone_path", "backbone_source")
+    places = ("backbone_path",)
     packages = ("torchcodec", "transformers", "timm", "openvino")
 
     def seeds_together(self, config: FrozenViTChunkConfig) -> bool:
@@ -122,7 +122,7 @@ class FeatureTrainer:
             asked = {seed: policy for seed, policy in zip(seeds, policies, strict=True) if writers[seed]}
             errors = heldout_mse([*asked.values()], features, held_out, preprocess)
             for (seed, policy), error in zip(asked.items(), errors, strict=True):
-                made_of = {config.backbone: _backbone_line(policy.config)}
+                made_of = {config.backbone: _backbone_line(policy)}
                 with writers[seed](heldout_mse_m2=error, made_of=made_of) as folder:
                     save_checkpoint(policy, features, folder)
 
@@ -250,8 +250,8 @@ def _precision(config: FrozenViTChunkConfig) -> str:
     return config.backbone_trained_precision or config.backbone_precision
 
 
-def _backbone_line(config: FrozenViTChunkConfig) -> str:
+def _backbone_line(policy: FrozenViTChunkPolicy) -> str:
     """What the backbone is, whose weights are none of the checkpoint's."""
-    precision, trained = config.backbone_precision, config.backbone_trained_precision
-    crossed = f", trained in {trained}" if trained != precision else ""
-    return f"{config.backbone_source}, SHA-256 {config.backbone_sha256[:12]}, {precision}{crossed}"
+    precision, record = policy.config.backbone_precision, policy.encoder_record
+    crossed = f", trained in {record.precision}" if record.precision != precision else ""
+    return f"{record.source}, SHA-256 {record.sha256[:12]}, {precision}{crossed}"

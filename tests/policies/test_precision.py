@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -44,8 +45,8 @@ def test_a_capped_cpu_has_no_bfloat16(monkeypatch):
 def test_auto_is_the_native_precision_and_recorded(native, machine, make_policy, tmp_path):
     machine(native)
     make_policy().save_pretrained(tmp_path)
-    recorded = json.loads((tmp_path / "config.json").read_text())
-    assert recorded["backbone_precision"] == recorded["backbone_trained_precision"] == native
+    config, record = (json.loads((tmp_path / name).read_text()) for name in ("config.json", "encoder.json"))
+    assert config["backbone_precision"] == record["precision"] == native
 
 
 def test_bfloat16_by_name_is_refused_where_it_would_be_emulated(machine, make_policy, weights):
@@ -81,16 +82,18 @@ def test_a_checkpoint_crosses_over_on_purpose_alone(machine, make_policy, images
         crossed.select_action(batch)
     assert caplog.text.count("trained on features in bfloat16, acts on features in float32") == 1
     crossed.save_pretrained(tmp_path / "crossed")
-    recorded = json.loads((tmp_path / "crossed" / "config.json").read_text())
-    assert (recorded["backbone_precision"], recorded["backbone_trained_precision"]) == ("float32", "bfloat16")
+    config, record = (
+        json.loads((tmp_path / "crossed" / name).read_text()) for name in ("config.json", "encoder.json")
+    )
+    assert (config["backbone_precision"], record["precision"]) == ("float32", "bfloat16")
 
 
 def test_what_is_trained_further_on_images_is_of_the_precision_it_saw(machine, make_policy):
     machine("bfloat16")
     policy = make_policy(backbone_precision="float32", backbone_trained_precision="bfloat16")
-    assert policy.eval().config.backbone_trained_precision == "bfloat16"
-    assert policy.train().config.backbone_trained_precision == "float32"
-    assert policy.config.backbone_trained_runtime == policy.backbone.runtime
+    assert policy.eval().encoder_record.precision == "bfloat16"
+    assert policy.train().encoder_record.precision == "float32"
+    assert policy.encoder_record.runtime == policy.backbone.runtime
 
 
 @pytest.mark.slow
@@ -116,7 +119,8 @@ def test_a_blind_encoder_drifts_as_far_as_its_features_of_grey(images):
 
 
 def test_features_of_a_cpu_are_told_apart_from_those_of_a_gpu(make_policy, images, monkeypatch, caplog):
-    policy = make_policy(backbone_precision="float32", backbone_trained_runtime="openvino")
+    policy = make_policy(backbone_precision="float32")
+    policy.encoder_record = replace(policy.encoder_record, runtime="openvino")
     policy._log_crossing(images)
     assert "acts on features" not in caplog.text
     monkeypatch.setattr(FrozenEncoder, "device", torch.device("cuda"))

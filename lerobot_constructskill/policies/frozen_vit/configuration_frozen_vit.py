@@ -11,20 +11,19 @@ from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, che
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
-from .backbone import IMAGE_SIZE
-from .backbones import check_backbone
-from .features import feature_key, point_key
-from .heads import REGRESSION_LOSSES
-from .precision import AUTO, PRECISIONS, RUNTIMES
+from .backbones import IMAGE_SIZE, check_backbone
+from .feature_sets import feature_key, point_key
+from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
 GRIPPER_NAME = "gripper"
 GRIPPER_HEADS = ("bce", "regression")
+REGRESSION_LOSSES = ("mse", "l1")
 
 LARGEST_EXPONENT = 80
-"""Of a weight in temporal ensembling: exp(88) is the last that float32 holds."""
+"""Largest exponent of a weight in temporal ensembling: float32 holds no more than exp(88)."""
 
 ChunkSize = Annotated[int, Range(1, 1000, unit="steps")]
 Width = Annotated[int, Range(1, 65_536)]
@@ -50,18 +49,17 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
         backbone: an entry of `backbones.BACKBONES`, or any model of timm as `timm/<model>` and of transformers as
             `hf/<owner>/<name>`; `@<commit>` at the end pins a version on the Hub.
-        backbone_path: folder or file with the weights; None looks at the Hub, then at installed packages that hold
-            them. So does a checkpoint (or a feature set) that knows their hash, if the path does not exist.
-        backbone_pretrained: False draws the weights of the same architecture at random, to measure what it gives.
-        backbone_source: written by the policy: where the weights came from.
-        backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
-            set, they must be those that made it) and checked whenever the checkpoint is loaded.
-        backbone_precision: what the backbone computes in: "float32", "bfloat16", or "auto", which becomes that of the
-            feature set, or without one the fastest that the device has natively.
-        backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. If
-            `backbone_precision` is another one, the log says so, with the drift of the features.
-        backbone_trained_runtime: written by the policy: what computed these features, "openvino" (a CPU) or "torch".
-            If it was OpenVINO and the policy acts on another device than a CPU, the log says so in the same way.
+        backbone_path: folder or file with the weights; None looks for an installed package that holds them, then at
+            the Hub. So does a checkpoint (or a feature set) that knows their hash, if the path does not exist.
+        backbone_pretrained: False draws the weights of the same architecture at random, to measure what pretraining
+            gives.
+        backbone_sha256: hash that the weights must have; None takes the backbone's known one, or where none is known
+            the weights that are found. A checkpoint records their hash in `encoder.json` and checks it on every load.
+        backbone_precision: number format that the backbone computes in: "float32", "bfloat16", or "auto", which
+            becomes the feature set's, or without one the fastest that the device has natively.
+        backbone_trained_precision: number format of the features that a study trains the heads on; None for
+            `backbone_precision`. A feature set and a checkpoint say their own. Where a policy acts on features of
+            another one, the log says so, with the drift of the features.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source of weights.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
@@ -70,7 +68,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
             ("spatial_softmax"), what a few learned queries find ("attention"), or where the object, the receptacle and
-            the hand are ("heat_maps"). On a feature set all but the first need its patch features, and the last learns
+            the hand are ("heat_maps"). On a feature set all but "cls" need its patch features, and "heat_maps" learns
             from its points.
         standardize_features: whether each feature is standardised by the data set's mean and deviation. The linear
             heads can express the same functions either way (the paper's is False), but Adam needs far fewer
@@ -92,19 +90,19 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
             exp(-coeff * i). -0.1 is the paper's exp(-0.1 k), where k is the steps since a chunk was predicted: the
             newest has most weight. None takes the newest chunk's first action.
-        regression_loss: what a translation's error costs: "mse", its square as in the paper, or "l1", its absolute
+        regression_loss: cost of a translation's error: "mse", its square as in the paper, or "l1", its absolute
             value as in ACT, whose slope does not vanish in the last millimetres.
         regression_weight: weight of the translations' loss (a squared error of about 1e-4 m2, an absolute one of
             about 3e-3 m) relative to the gripper's. It matters only with a readout that learns, because both heads
             then share its parameters.
         point_weight: weight of the error of the points that the readout finds (half the image is 1) relative to the
-            gripper's loss; only with a readout that finds points.
+            gripper's loss. Only a readout that finds points takes another one than 1.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
             None keeps it constant.
     """
 
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
-    """What trains it in a study, a `training.trainers.Trainer`: many seeds at once, on features encoded once."""
+    """The `training.trainers.Trainer` of a study: many seeds at once, on features encoded once."""
 
     device: DeviceName | None = None
     n_obs_steps: Annotated[int, Range(1, 1)] = 1
@@ -122,11 +120,9 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone: Text = "dinov2_vits14"
     backbone_path: Text | None = None
     backbone_pretrained: bool = True
-    backbone_source: str | None = None
-    backbone_sha256: str | None = None
+    backbone_sha256: Annotated[str, Pattern("[0-9a-f]{64}", "64 hexadecimal digits")] | None = None
     backbone_precision: Annotated[str, Among((AUTO, *PRECISIONS))] = AUTO
     backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
-    backbone_trained_runtime: Annotated[str, Among(RUNTIMES)] | None = None
     save_backbone: bool = True
     camera: Word = "base"
     crop: list[Edge] | None = None
@@ -144,7 +140,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     gripper_threshold: Logit = 0.5
     temporal_ensemble_coeff: Logit | None = -0.1
 
-    regression_loss: Annotated[str, Among(tuple(REGRESSION_LOSSES))] = "mse"
+    regression_loss: Annotated[str, Among(REGRESSION_LOSSES)] = "mse"
     regression_weight: Weight = 1.0
     point_weight: Weight = 1.0
     optimizer_lr: Rate = 1e-3
@@ -166,6 +162,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
                 f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
                 "set are those of its pooled feature."
             )
+        if self.point_weight != 1 and not READOUTS[self.readout].points:
+            raise InputError(f"point_weight weighs points, and readout={self.readout} finds none: leave it at 1.")
         _check_action_names(self.action_names)
         untouched = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
         if not untouched.items() <= self.normalization_mapping.items():
@@ -199,11 +197,6 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     @property
     def point_key(self) -> str:
         return point_key(self.camera)
-
-    @property
-    def losses(self) -> dict[str, str]:
-        """What errors cost, as `heads.chunk_errors` takes it."""
-        return {"gripper_head": self.gripper_head, "regression_loss": self.regression_loss}
 
     @property
     def feature_column(self) -> dict[str, Any] | None:
@@ -284,7 +277,7 @@ def check_crop(crop: list[float] | None) -> None:
     if crop is None:
         return
     left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
-    least = 2 / IMAGE_SIZE  # of one pixel nothing may be left, where its edges are rounded
+    least = 2 / IMAGE_SIZE  # rounding its edges may leave nothing of a single pixel
     if not (0 <= left <= right - least <= 1 - least and 0 <= top <= bottom - least <= 1 - least):
         raise InputError(
             f"crop must be left, top, right and bottom in shares of the image, at least two pixels of "
@@ -294,14 +287,8 @@ def check_crop(crop: list[float] | None) -> None:
 
 def _check_action_names(names: Any) -> None:
     known = (*TRANSLATION_NAMES, *ROTATION_NAMES)
-    served = (
-        isinstance(names, list)
-        and len(names) > 1
-        and names[-1] == GRIPPER_NAME
-        and len(set(names)) == len(names)
-        and set(names[:-1]) <= set(known)
-    )
-    if not served:
+    moves = names[:-1] if isinstance(names, list) and names[-1:] == [GRIPPER_NAME] else []
+    if not moves or len(set(moves)) < len(moves) or not set(moves) <= set(known):
         raise InputError(
             f"action_names must be one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}', "
             f"not {names}."

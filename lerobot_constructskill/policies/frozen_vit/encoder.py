@@ -2,21 +2,45 @@
 
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from lerobot_constructskill.files import Json
+
 from . import openvino
-from .backbone import IMAGE_SIZE, Backbone
+from .backbones import IMAGE_SIZE, Backbone
 from .precision import computing_in, is_native
 
 GREY = 0.5
-"""What a blind encoder sees, in every pixel."""
+"""Value of every pixel that a blind encoder sees."""
 
 Crop = Sequence[float]
 """Left, top, right and bottom edge of the part of an image that is looked at, in shares of its width and height."""
+
+
+@dataclass(frozen=True)
+class EncoderRecord:
+    """What a checkpoint says of its encoder, in `encoder.json` beside its weights. The policy writes it.
+
+    Args:
+        source: where the backbone's weights came from.
+        sha256: hash of these weights. It is checked whenever the checkpoint is loaded.
+        precision: number format of the features that the heads learned from.
+        runtime: what computed these features, OpenVINO (on a CPU) or PyTorch; None where a feature set does not say.
+    """
+
+    source: str | None = None
+    sha256: str | None = None
+    precision: Literal["float32", "bfloat16"] | None = None
+    runtime: Literal["openvino", "torch"] | None = None
+
+
+RECORD_FILE = "encoder.json"
+RECORD = Json("the record of a policy's encoder", EncoderRecord)
 
 
 class FrozenEncoder(nn.Module):
@@ -55,7 +79,8 @@ class FrozenEncoder(nn.Module):
     @property
     def runtime(self) -> str:
         """What computes the features on this machine."""
-        return "openvino" if self._is_compiled_for(self.device) else "torch"
+        on_cpu = self.device.type == "cpu" and openvino.is_installed() and is_native(self.precision, self.device)
+        return "openvino" if on_cpu else "torch"
 
     def train(self, mode: bool = True) -> "FrozenEncoder":
         return super().train(False)
@@ -81,11 +106,8 @@ class FrozenEncoder(nn.Module):
         return tuple(tokens.to(images.device).expand(len(images), *tokens.shape[1:]) for tokens in self._of_grey)
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        if self._is_compiled_for(self.device):
-            return self._encode_compiled(images)
-        return self._encode_eagerly(images, self.precision)
-
-    def _encode_compiled(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        if self.runtime == "torch":
+            return self._encode_eagerly(images, self.precision)
         with computing_in("float32", self.device):  # OpenVINO cannot convert the casts of autocast
             if self._compiled is None:
                 self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
@@ -127,9 +149,6 @@ class FrozenEncoder(nn.Module):
             size = (IMAGE_SIZE, IMAGE_SIZE)
             images = F.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)
         return (images - self.mean) / self.std
-
-    def _is_compiled_for(self, device: torch.device) -> bool:
-        return device.type == "cpu" and openvino.is_installed() and is_native(self.precision, device)
 
     def _forget_compiled(self, *_: Any) -> None:
         self._compiled = self._of_grey = None
