@@ -102,7 +102,8 @@ def write_feature_set(
     info = info | _source(dataset) | batch_facts(encoder.device, batch_size)
     # Whatever decides the content is in the folder's name, so nothing made otherwise is taken for a part.
     parts = folder.with_name(PARTS) / digest({**info, "camera": camera, "patches": patches})
-    found = _points_column(dataset, camera, encoder.crop) if points else {}
+    poses = {name: _column(dataset, name) for name in POSES.values() if points and name in dataset.meta.features}
+    found = {point_key(camera): find_points(poses, camera, encoder.crop)} if points else {}
     columns = {feature_key(camera): _encode_frames(dataset, camera, encoder, batch_size, parts, patches), **found}
     files = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes] if patches else []
     _write_copy(dataset, camera, columns, files, info, repo_id, folder)
@@ -133,12 +134,6 @@ def join_feature_sets(
 
 def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
     return np.stack(dataset.hf_dataset.with_format("numpy")[name][:])
-
-
-def _points_column(dataset: LeRobotDataset, camera: str, crop: Crop | None) -> dict[str, np.ndarray]:
-    """Return the column of points, by its name."""
-    known = {name: _column(dataset, name) for name in POSES.values() if name in dataset.meta.features}
-    return {point_key(camera): find_points(known, camera, crop)}
 
 
 def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:

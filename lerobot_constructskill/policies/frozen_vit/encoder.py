@@ -1,7 +1,6 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -68,7 +67,6 @@ class FrozenEncoder(nn.Module):
         self.register_buffer("mean", torch.tensor(backbone.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(backbone.std).view(1, 3, 1, 1), persistent=False)
         self._compiled: openvino.OpenVINOEncoder | None = None
-        self._of_grey: tuple[Tensor, Tensor] | None = None
         self.model.register_load_state_dict_post_hook(self._forget_compiled)  # a method, so that a copy has its own
         self.train(False)
 
@@ -99,43 +97,23 @@ class FrozenEncoder(nn.Module):
     @torch.no_grad()
     def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pooled features (B, D) and the patch features (B, N, D) of images, float32."""
-        if not self.blind:
-            return self._encode(images)
-        if self._of_grey is None:
-            self._of_grey = self._encode(torch.full_like(images[:1].float(), GREY))
-        return tuple(tokens.to(images.device).expand(len(images), *tokens.shape[1:]) for tokens in self._of_grey)
+        pooled, patches = self._encode(torch.full_like(images[:1].float(), GREY) if self.blind else images)
+        return pooled.expand(len(images), -1), patches.expand(len(images), -1, -1)
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        if self.runtime == "torch":
-            return self._encode_eagerly(images, self.precision)
         with computing_in("float32", self.device):  # OpenVINO cannot convert the casts of autocast
-            if self._compiled is None:
-                self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
-            return self._compiled(self.preprocess(images))
-
-    @torch.no_grad()
-    def _encode_eagerly(self, images: Tensor, precision: str) -> tuple[Tensor, Tensor]:
-        with computing_in("float32", self.device):
             pixels = self.preprocess(images)
-        with computing_in(precision, self.device):
+            if self.runtime == "openvino":
+                return self._compile()(pixels)
+        with computing_in(self.precision, self.device):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()
 
-    def drift(self, images: Tensor, precision: str, on_cpu: bool = False) -> float:
-        """How far the patch features of images are from others, in shares of the others' norm.
-
-        PyTorch computes the others, also where it has to emulate their precision.
-
-        Args:
-            precision: that of the others.
-            on_cpu: whether a CPU computes the others, instead of this encoder's own device.
-        """
-        if self.blind:
-            images = torch.full_like(images[:1].float(), GREY)
-        ours = self.encode(images)[1].cpu()
-        other = deepcopy(self).cpu() if on_cpu else self
-        theirs = other._encode_eagerly(images.to(other.device), precision)[1].cpu()
-        return ((ours - theirs).norm() / theirs.norm()).item()
+    def _compile(self) -> openvino.OpenVINOEncoder:
+        """Return the backbone compiled for this CPU, which is done once."""
+        if self._compiled is None:
+            self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
+        return self._compiled
 
     def preprocess(self, images: Tensor) -> Tensor:
         """Crop, resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
@@ -151,7 +129,7 @@ class FrozenEncoder(nn.Module):
         return (images - self.mean) / self.std
 
     def _forget_compiled(self, *_: Any) -> None:
-        self._compiled = self._of_grey = None
+        self._compiled = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_compiled": None}  # for copies and other processes, which compile their own

@@ -18,8 +18,6 @@ from .backbones import IMAGE_SIZE, Backbone
 
 FEATURE_PREFIX = "observation.features."
 
-POINT_PREFIX = "observation.points."
-
 PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i is the frame `index` i."""
 
@@ -34,7 +32,7 @@ def feature_key(camera: str) -> str:
 
 def point_key(camera: str) -> str:
     """Column that says where in the frames of `camera` a readout's points are, (2P,) float32 from -1 to 1."""
-    return POINT_PREFIX + camera
+    return f"observation.points.{camera}"
 
 
 def open_patches(root: Path) -> Tensor:

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from lerobot_constructskill.files import Json
 from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
-from .ensembling import ensemble
 from .feature_sets import check_features, describe, open_patches, stated
 from .heads import ChunkHeads, heads_loss, offsets
 from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
@@ -33,7 +32,7 @@ HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
-DECISIVE = ("backbone", "readout", "crop", "blind", "gripper_head", "action_scale")
+DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "gripper_head", "action_scale")
 """Fields that give other numbers of the same shape to the heads, or read other actions out of theirs."""
 
 SILENT = 1e-3
@@ -77,8 +76,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.config = config
         self.readout = READOUTS[config.readout]
         if dataset_meta is not None:
-            config.check_rate(dataset_meta.fps)
-            self._check_points(dataset_meta.features)
+            self._check_data_set(dataset_meta)
         self.encoder_record = self._begin_record(encoder_record)
         spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
@@ -127,7 +125,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         points = batch.get(self.config.point_key) if self.readout.points else None
         if self.readout.points and points is None:
             raise self._lacks_points()
-        chunk, read = self._apply_heads(batch)
+        chunk, read = self.heads(*self.head_inputs(batch))
         if not self.training:
             error, count = self._translation_error(chunk, batch)
             self._heldout = (self._heldout[0] + error, self._heldout[1] + count)
@@ -185,10 +183,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         cls, model: "FrozenViTChunkPolicy", model_file: str, map_location: str, strict: bool
     ) -> "FrozenViTChunkPolicy":
         state = read_tensors(Path(model_file))
-        holds_backbone = any(name.startswith(BACKBONE_PREFIX) for name in state)
-        if not holds_backbone:
+        if not any(name.startswith(BACKBONE_PREFIX) for name in state):
             model._load_backbone()
-            state |= {BACKBONE_PREFIX + name: t for name, t in model.backbone.state_dict().items()}
         try:
             model.load_state_dict(state, strict=True)
         except RuntimeError as error:
@@ -198,15 +194,13 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 "config.json it was saved with, or train again."
             ) from None
         model._check_inputs(Path(model_file).with_name("config.json"))
-        if holds_backbone:
-            model._check_backbone(model_file)
-        model._check_statistics(model_file)
+        found, recorded = state_sha256(model.backbone.model.state_dict()), model.encoder_record.sha256
+        if found != recorded:
+            raise InputError(
+                f"The backbone in '{model_file}' has sha256 {found[:12]}, but {RECORD_FILE} records "
+                f"{str(recorded)[:12]}: one of the two files was changed; copy or download the checkpoint again."
+            )
         return model
-
-    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> None:
-        raise NotImplementedError(
-            "frozen_vit trains two linear layers on a frozen backbone; PEFT has nothing to adapt."
-        )
 
     def _begin_record(self, recorded: EncoderRecord | None) -> EncoderRecord:
         """Return what is known of the encoder before its weights are there, and settle its precision.
@@ -228,9 +222,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             made_by = describe(encoder.spec, record.sha256, record.precision, encoder.crop, encoder.blind)
             check_features(column, made_by, encoder.spec.feature_dim)
 
-    def _check_points(self, features: Mapping[str, Mapping]) -> None:
-        """Refuse a data set that does not say where the points are that the readout learns to find."""
-        found = features.get(self.config.point_key, {}).get("names")
+    def _check_data_set(self, meta: Any) -> None:
+        """Refuse a data set of another rate, or without the points that the readout learns to find."""
+        if meta.fps != self.config.fps:
+            raise InputError(
+                f"The data set has {meta.fps} frames a second and the policy acts at {self.config.fps} Hz: train on a "
+                "set of that rate, or set fps if what it is for runs at another."
+            )
+        found = meta.features.get(self.config.point_key, {}).get("names")
         if self.readout.points and found != [*self.readout.points]:
             raise self._lacks_points()
 
@@ -246,15 +245,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if self.config.feature_column is not None and self.readout.reads_patches:
             open_patches(root)
 
-    def _log_crossing(self, image: Tensor) -> None:
-        """Log that features are computed otherwise than those that the heads learned from, and how far they differ."""
-        precision, trained = self.config.backbone_precision, self.encoder_record.precision
-        on_cpu = self.encoder_record.runtime == "openvino" and self.backbone.device.type != "cpu"
-        if precision != trained or on_cpu:
-            learned, acts = ("of a CPU ", f"of {self.backbone.device} ") if on_cpu else ("", "")
-            crossing = f"frozen_vit, trained on features {learned}in {trained}, acts on features {acts}in {precision}"
-            share = 100 * self.backbone.drift(image, trained, on_cpu)
-            logger.warning("%s; on its first image they differ by %.2g %% of their norm.", crossing, share)
+    def _log_crossing(self) -> None:
+        """Log that features are computed otherwise than those that the heads learned from."""
+        record, encoder = self.encoder_record, self.backbone
+        left_cpu = record.runtime == "openvino" and encoder.device.type != "cpu"
+        if encoder.precision != record.precision or left_cpu:
+            logger.warning(
+                "frozen_vit, trained on features of %s in %s, acts on features of %s in %s: they differ a little.",
+                *(record.runtime, record.precision, encoder.runtime, encoder.precision),
+            )
 
     def _load_backbone(self) -> None:
         config, record = self.config, self.encoder_record
@@ -287,23 +286,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             if asked != value:
                 raise InputError(f"The checkpoint was trained with {name}={value}, so it cannot have {name}={asked}.")
 
-    def _check_backbone(self, model_file: str) -> None:
-        found, recorded = state_sha256(self.backbone.model.state_dict()), self.encoder_record.sha256
-        if found != recorded:
-            raise InputError(
-                f"The backbone in '{model_file}' has sha256 {found[:12]}, but {RECORD_FILE} records "
-                f"{str(recorded)[:12]}: one of the two files was changed; copy or download the checkpoint again."
-            )
-
-    def _check_statistics(self, model_file: str) -> None:
-        asked = self.config.standardize_features
-        trained = bool(self.feature_mean.any() or (self.feature_std != 1).any())
-        if asked != trained:
-            raise InputError(
-                f"'{model_file}' was trained with standardize_features={str(trained).lower()}, but the configuration "
-                f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
-            )
-
     def read_features(self, meta: Any) -> None:
         """Read a data set's features from now on, if it has those of the policy's camera in place of its images.
 
@@ -326,7 +308,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """
         if not self._has_seen:
             check_native(self.config.backbone_precision, self.config.device)
-            self._log_crossing(images[:1])
+            self._log_crossing()
             self._has_seen = True
         return self.readout.pool(*self.backbone.encode(images))
 
@@ -353,10 +335,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         return squares.sum().item(), int((~padded).sum()) * len(metres)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        return self._apply_heads(batch)[0]
-
-    def _apply_heads(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        return self.heads(*self.head_inputs(batch))
+        return self.heads(*self.head_inputs(batch))[0]
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
         if POOLED in batch:
@@ -378,6 +357,27 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         boundary = 0.0 if self.config.gripper_head == "regression" else self.config.gripper_threshold
         gripper = torch.where(raw[..., -1:] > boundary, 1.0, -1.0)
         return torch.cat([raw[..., :-1], gripper], dim=-1)
+
+
+def ensemble(chunks: Sequence[Tensor], coeff: float) -> Tensor:
+    """Average what each chunk says about the current step.
+
+    The weights are LeRobot's (`ACTTemporalEnsembler`): exp(-coeff * i) with i = 0 for the oldest chunk, so a
+    negative coefficient weighs the newest chunk most. With coeff = -0.1 the weights are, up to their sum, the
+    paper's exp(-0.1 k), k being the steps since a chunk was predicted.
+
+    Args:
+        chunks: the last chunks, one per step, newest last, each (B, T, A); at most T of them, so that each
+            still covers the current step.
+        coeff: decay per step.
+
+    Returns:
+        (B, A)
+    """
+    newest = len(chunks) - 1
+    current = torch.stack([chunk[:, newest - i] for i, chunk in enumerate(chunks)])
+    weights = torch.exp(-coeff * torch.arange(len(chunks), device=current.device, dtype=current.dtype))
+    return torch.einsum("n,nba->ba", weights / weights.sum(), current)
 
 
 def _read_record(checkpoint: str | Path, options: Mapping[str, Any]) -> EncoderRecord:
@@ -411,6 +411,5 @@ def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metad
 
 
 def _excuse_backbone(policy: FrozenViTChunkPolicy, incompatible: Any) -> None:
-    if not policy.config.save_backbone:
-        missing = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]
-        incompatible.missing_keys[:] = missing
+    """Let state dicts be without the backbone, whose hash tells whether it is whole."""
+    incompatible.missing_keys[:] = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]

