@@ -245,9 +245,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig | None:
-        if self.scheduler_warmup_steps is None:
-            return None
-        return CosineAnnealingWithWarmupSchedulerConfig(self.scheduler_warmup_steps)
+        steps = self.scheduler_warmup_steps
+        return None if steps is None else CosineAnnealingWithWarmupSchedulerConfig(steps)
 
     @property
     def observation_delta_indices(self) -> None:

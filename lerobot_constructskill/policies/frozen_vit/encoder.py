@@ -124,8 +124,7 @@ class FrozenEncoder(nn.Module):
                 ..., round(top * height) : round(bottom * height), round(left * width) : round(right * width)
             ]
         if images.shape[-2:] != (IMAGE_SIZE, IMAGE_SIZE):
-            size = (IMAGE_SIZE, IMAGE_SIZE)
-            images = F.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)
+            images = F.interpolate(images, (IMAGE_SIZE, IMAGE_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
         return (images - self.mean) / self.std
 
     def _forget_compiled(self, *_: Any) -> None:

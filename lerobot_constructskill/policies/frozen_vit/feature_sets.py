@@ -108,11 +108,9 @@ def describe(
 ) -> dict[str, str | None]:
     """Return the description of an encoder's features, a column's `info`. A policy that reads them compares it."""
     resize = f"bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size"
-    pixels = ["[0, 1]", resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
-    if crop is not None:
-        pixels.insert(1, f"crop {[float(edge) for edge in crop]}")
-    if blind:
-        pixels.insert(0, "grey in place of the image")
+    cropped = [] if crop is None else [f"crop {[float(edge) for edge in crop]}"]
+    seen = ["grey in place of the image", "[0, 1]"] if blind else ["[0, 1]"]
+    pixels = [*seen, *cropped, resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
     return {
         "backbone": backbone.name,
         "weights_sha256": weights_sha256,

@@ -11,14 +11,14 @@ from torch import Tensor
 from .feature_sets import describe
 
 POOLED = "observation.pooled"
-"""Entry of a batch in place of the image: what `FrozenViTChunkPolicy.pool` returns for it."""
+"""Entry of a batch beside the image: what `FrozenViTChunkPolicy.pool` returns for it."""
 
 BATCH = 16
 """Frames that a GPU encodes at once. The last one is repeated where there are fewer."""
 
 
 class SharedEncoders:
-    """Puts what their readouts take of an image in place of the image, for policies of which many share an encoder.
+    """Encodes each image once for policies of which many share an encoder.
 
     Args:
         policies: of frozen_vit, by number. Those whose encoders are the same get one object.
@@ -32,7 +32,7 @@ class SharedEncoders:
             policy.backbone = cache.policy.backbone
 
     def __call__(self, batches: Mapping[int, dict]) -> dict[int, dict | Exception]:
-        """Return preprocessed batches of one frame each, by policy, with `POOLED` in place of the image.
+        """Return preprocessed batches of one frame each, by policy, with `POOLED` beside the image.
 
         A batch without the image stays as it is. An encoder that fails fails for the policies that share it, whose
         exception stands in place of their batches.
@@ -47,8 +47,7 @@ class SharedEncoders:
                 seen |= dict.fromkeys(numbers, error)
                 continue
             for number, features in zip(numbers, pooled, strict=True):
-                others = {name: value for name, value in batches[number].items() if name != key}
-                seen[number] = {**others, POOLED: features}
+                seen[number] = {**batches[number], POOLED: features}
         return seen
 
 

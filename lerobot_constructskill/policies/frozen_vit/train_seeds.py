@@ -6,7 +6,6 @@ trains: sums over several depend on their number, and so would the weights on ho
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from copy import copy, deepcopy
 from functools import partial
 from pathlib import Path
@@ -62,8 +61,12 @@ def train_seeds(
     heads = [_fresh_heads(template, seed) for seed in seeds]
     n_steps = epochs * -(-len(rows) // batch_size)
     batches = Progress(_batches(rows, seeds, epochs, batch_size), f"training {len(seeds)} seeds", n_steps, unit="step")
-    with one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
         _step_together(heads, template.config, inputs, table, batches, n_steps)
+    finally:
+        torch.set_num_threads(threads)
     return [with_heads(template, its_heads) for its_heads in heads]
 
 
@@ -94,17 +97,6 @@ def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folde
     policy.save_pretrained(folder)
     for processor in make_pre_post_processors(policy.config, dataset_stats=dataset.meta.stats):
         processor.save_pretrained(folder)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Have torch compute in this thread alone for as long as the block takes."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _batches(rows: Tensor, seeds: Sequence[int], epochs: int, batch_size: int) -> Iterator[Tensor]:
@@ -236,7 +228,7 @@ def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
 
 
 def with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
-    """A copy of a policy with other heads and the same backbone."""
+    """Return a copy of a policy with other heads and the same backbone."""
     policy = deepcopy(template, {id(template.backbone): template.backbone})
     policy.heads = heads
     return policy

