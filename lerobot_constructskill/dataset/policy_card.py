@@ -39,7 +39,8 @@ def render_outcomes(
     encoder: dict[str, Any] | None = None,
 ) -> str:
     """The section, in Markdown, from `train_config.json` (`TRAINED`), `config.json` and any `encoder.json`."""
-    backbone = {**(encoder or {}), "precision": policy.get("backbone_precision")}
+    backbone = {name: (encoder or {}).get(name) for name in ("source", "sha256")}
+    backbone["precision"] = policy.get("backbone_precision")
     return markdown.render(
         "policy_card.md.j2",
         outcomes=outcomes,
