@@ -10,7 +10,7 @@ import torch
 from measure import OUT, report
 
 from lerobot_constructskill.features.encode import load_encoder
-from lerobot_constructskill.policies.frozen_vit.backbone import IMAGE_SIZE
+from lerobot_constructskill.policies.frozen_vit.backbones import IMAGE_SIZE
 from lerobot_constructskill.policies.frozen_vit.openvino import OpenVINOEncoder, Traceable
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
 

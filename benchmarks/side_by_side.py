@@ -20,14 +20,15 @@ def steps_a_second(threads: int) -> float:
     """Of one seed, in this process."""
     import torch
 
+    from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
     from lerobot_constructskill.policies.frozen_vit.heads import ChunkHeads
-    from lerobot_constructskill.policies.frozen_vit.readouts import KEYPOINTS, SpatialSoftmax
 
     torch.set_flush_denormal(True)
     torch.set_num_threads(threads)
     torch.manual_seed(0)
     maps = torch.randn(ROWS, PATCHES, DIM, dtype=torch.float16)
-    heads = ChunkHeads(SpatialSoftmax(DIM), 2 * KEYPOINTS, 8, 3, 0.1, 256, 3)
+    config = FrozenViTChunkConfig(device="cpu", readout="spatial_softmax", head_hidden_dim=256, head_hidden_layers=3)
+    heads = ChunkHeads(config, DIM)
     optimizer = torch.optim.AdamW(heads.parameters(), 1e-3)
     start = 0.0
     for step in range(WARM + STEPS):

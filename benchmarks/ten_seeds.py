@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies import make_pre_post_processors
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
+from lerobot_constructskill.rollout.heldout import heldout_mse
 
 DINOV2 = {"standardize_features": True}  # configs/train/frozen_vit_fast.yaml
 
@@ -22,11 +22,9 @@ def main(folder: Path, n_seeds: int, batch_size: int, weights: str | None = None
     dataset = LeRobotDataset("local/features", root=folder / "features")
     episodes = held_out(dataset.num_episodes)
     policies = train_seeds(config, dataset, range(n_seeds), 10, batch_size, episodes)
-    preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=dataset.meta.stats)
-    errors = heldout_mse(policies, dataset, episodes, preprocess)
-    for seed, (policy, error) in enumerate(zip(policies, errors, strict=True)):
-        save_checkpoint(policy, dataset, folder / "checkpoints" / f"seed_{seed}")
-        print(f"seed {seed}: held-out translation error {error:.2e} m2")
+    for seed, policy in enumerate(policies):
+        save_checkpoint(policy, dataset, checkpoint := folder / "checkpoints" / f"seed_{seed}")
+        print(f"seed {seed}: held-out translation error {heldout_mse(checkpoint, dataset, episodes):.2e} m2")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, bind_patches, describe
+from lerobot_constructskill.policies.frozen_vit.feature_sets import PATCHES_FILE, bind_patches, describe
 from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from commands import QUICK, call
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
+from lerobot_constructskill.rollout.heldout import heldout_mse
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -73,8 +73,9 @@ def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reac
     dataset, config = LeRobotDataset(repo_id, root=root), FrozenViTChunkConfig(device="cpu")
     episodes = held_out(dataset.num_episodes, 2)
     policies = train_seeds(config, dataset, range(20), epochs=15, batch_size=70, held_out=episodes)
-    preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=dataset.meta.stats)
-    ours = heldout_mse(policies, dataset, episodes, preprocess)
+    for seed, policy in enumerate(policies):
+        save_checkpoint(policy, dataset, folder / f"seed_{seed}")
+    ours = [heldout_mse(folder / f"seed_{seed}", dataset, episodes) for seed in range(20)]
     middle, spread = np.mean(ours), np.std(ours, ddof=1)
     assert abs(theirs - middle) < 4 * spread < middle, (theirs, ours)
 

@@ -2,7 +2,9 @@
 
 import ast
 import inspect
+import json
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +19,7 @@ from lerobot.utils import constants
 from lerobot_constructskill import lerobot_internals
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT, NAMES, TRAIN_CONFIG
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
+from lerobot_constructskill.policies.frozen_vit.encoder import EncoderRecord
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 
 ROOT = Path(__file__).parents[1]
@@ -137,9 +140,13 @@ def test_lerobot_loads_a_checkpoint_by_the_method_that_we_override(monkeypatch, 
 
     monkeypatch.setattr(FrozenViTChunkPolicy, "__init__", init)
     monkeypatch.setattr(FrozenViTChunkPolicy, "_load_as_safetensor", load)
+    record = EncoderRecord(sha256="0" * 64)
+    (tmp_path / "encoder.json").write_text(json.dumps(asdict(record)))
     with pytest.raises(InterruptedError):
         FrozenViTChunkPolicy.from_pretrained(tmp_path, config=FrozenViTChunkConfig(device="cpu"))
-    assert given["load_backbone"] is False, f"{LEROBOT} keeps from_pretrained's own arguments from a policy: {given}."
+    assert given["encoder_record"] == record, (
+        f"{LEROBOT} keeps from_pretrained's own arguments from a policy: {given}."
+    )
     model, file, device, strict = given["loads"]
     assert (Path(file).name, device, strict) == ("model.safetensors", "cpu", False), f"{LEROBOT} loads from {file}."
 

@@ -32,10 +32,15 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
 
 
 def render_outcomes(
-    outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
+    outcomes: list[tuple[int, int, int, int]],
+    task: str,
+    train: dict[str, Any],
+    policy: dict[str, Any],
+    encoder: dict[str, Any] | None = None,
 ) -> str:
-    """The section, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
-    backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256", "precision")}
+    """The section, in Markdown, from `train_config.json` (`TRAINED`), `config.json` and any `encoder.json`."""
+    backbone = {name: (encoder or {}).get(name) for name in ("source", "sha256")}
+    backbone["precision"] = policy.get("backbone_precision")
     return markdown.render(
         "policy_card.md.j2",
         outcomes=outcomes,

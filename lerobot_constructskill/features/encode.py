@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from lerobot_constructskill.files import read_parquet
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncoder
-from lerobot_constructskill.policies.frozen_vit.features import (
+from lerobot_constructskill.policies.frozen_vit.feature_sets import (
     PATCHES_FILE,
     bind_patches,
     describe,
@@ -36,8 +35,8 @@ PARTS = "encoded"
 PATCHES = ".patches.npy"
 
 BATCH, BATCHES = 16, {"cuda": 256}
-"""Images that are encoded at a time by default, and by kinds of devices on which more are faster. On those the last
-bits of a feature depend on the batch, so the description of the features names its size."""
+"""Images that are encoded at a time by default, and on kinds of devices where more are faster. There the last bits of
+a feature depend on the batch, so the description of the features names its size."""
 
 
 def load_encoder(
@@ -68,7 +67,7 @@ def load_encoder(
 
 
 def batch_facts(device: torch.device | str, batch_size: int | None = None) -> dict[str, str]:
-    """What the description of features says of their batch: its size, on a device of `BATCHES`."""
+    """Return what the description of features says of their batch: its size, on a device of `BATCHES`."""
     kind = torch.device(device).type
     return {"batch_size": str(batch_size or BATCHES[kind])} if kind in BATCHES else {}
 
@@ -92,7 +91,7 @@ def write_feature_set(
     Args:
         encoder: what encodes, and with `info` its description, as `load_encoder` returns them.
         folder: where to, a path that `staged` gave; episodes that a killed run finished are not encoded again.
-        batch_size: images at a time; that of the encoder's device by default.
+        batch_size: images at a time; by default as many as suit the encoder's device.
         patches: whether to write every patch's feature as well, to `PATCHES_FILE`.
         points: whether to write as well where in the image the points of `readouts.POINTS` are.
 
@@ -100,16 +99,14 @@ def write_feature_set(
         ValueError: the data set has no such camera, or does not say where things are.
     """
     batch_size = batch_size or BATCHES.get(encoder.device.type, BATCH)
-    info = _with_source(info, dataset) | batch_facts(encoder.device, batch_size)
-    made_of = {**info, "camera": camera, "patches": patches}
-    parts = _parts_folder(folder, made_of)
-    found = _find_points(dataset, camera, encoder.crop) if points else {}
-    features = _encode_frames(dataset, camera, encoder, batch_size, parts, patches)
-    _write_copy(dataset, camera, features, info, repo_id, folder, found)
-    if patches:
-        of_episodes = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes]
-        _join_files(of_episodes, dataset.num_frames, folder / PATCHES_FILE)
-        bind_patches(folder)
+    info = info | _source(dataset) | batch_facts(encoder.device, batch_size)
+    # Whatever decides the content is in the folder's name, so nothing made otherwise is taken for a part.
+    parts = folder.with_name(PARTS) / digest({**info, "camera": camera, "patches": patches})
+    poses = {name: _column(dataset, name) for name in POSES.values() if points and name in dataset.meta.features}
+    found = {point_key(camera): find_points(poses, camera, encoder.crop)} if points else {}
+    columns = {feature_key(camera): _encode_frames(dataset, camera, encoder, batch_size, parts, patches), **found}
+    files = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes] if patches else []
+    _write_copy(dataset, camera, columns, files, info, repo_id, folder)
 
 
 def join_feature_sets(
@@ -127,26 +124,16 @@ def join_feature_sets(
     Raises:
         ValueError: the parts have other numbers of frames.
     """
-    key = feature_key(camera)
-    pooled = [_column(part, key) for part in parts]
-    name = point_key(camera)
-    found = {name: np.concatenate([_column(part, name) for part in parts])} if points else {}
-    if sum(map(len, pooled)) != dataset.num_frames:
+    names = [feature_key(camera), *([point_key(camera)] if points else [])]
+    columns = {name: np.concatenate([_column(part, name) for part in parts]) for name in names}
+    if len(columns[feature_key(camera)]) != dataset.num_frames:
         raise InputError(f"The parts of '{dataset.repo_id}' do not add up to its {dataset.num_frames} frames.")
-    _write_copy(dataset, camera, np.concatenate(pooled), _with_source(info, dataset), repo_id, folder, found)
-    if patches:
-        _join_files([part.root / PATCHES_FILE for part in parts], dataset.num_frames, folder / PATCHES_FILE)
-        bind_patches(folder)
+    files = [part.root / PATCHES_FILE for part in parts] if patches else []
+    _write_copy(dataset, camera, columns, files, info | _source(dataset), repo_id, folder)
 
 
 def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
     return np.stack(dataset.hf_dataset.with_format("numpy")[name][:])
-
-
-def _find_points(dataset: LeRobotDataset, camera: str, crop: Crop | None) -> dict[str, np.ndarray]:
-    """The column of points, by its name."""
-    known = {name: _column(dataset, name) for name in POSES.values() if name in dataset.meta.features}
-    return {point_key(camera): find_points(known, camera, crop)}
 
 
 def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
@@ -159,8 +146,8 @@ def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
             out.write(np.load(file, mmap_mode="r"))
 
 
-def _with_source(info: dict[str, str], dataset: LeRobotDataset) -> dict[str, str]:
-    return {**info, "source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
+def _source(dataset: LeRobotDataset) -> dict[str, str]:
+    return {"source_repo_id": dataset.repo_id, "source_sha256": data_sha256(dataset.root)}
 
 
 def _encode_frames(
@@ -181,19 +168,11 @@ def _encode_frames(
                 batches.append(_encode(encoder, images, patches))
                 progress.update(len(images))
             pooled, tokens = zip(*batches, strict=True)
-            file = _part(parts, episode)
-            if patches:
-                _save(file.with_suffix(PATCHES), np.concatenate(tokens))
-            _save(file, np.concatenate(pooled))  # last: it says that the episode is finished
+            made = {PATCHES: tokens, ".npy": pooled} if patches else {".npy": pooled}
+            for suffix, arrays in made.items():  # the pooled ones last: they say that the episode is finished
+                with replaced(_part(parts, episode).with_suffix(suffix)) as partial:
+                    np.save(partial, np.concatenate(arrays))
     return np.concatenate([np.load(_part(parts, episode)) for episode in dataset.meta.episodes])
-
-
-def _parts_folder(folder: Path, made_of: dict[str, Any]) -> Path:
-    """Where the finished episodes of a feature set lie that is being written to `folder`.
-
-    Nothing that was made otherwise is ever taken for a part: what they are made of is in the folder's name.
-    """
-    return folder.with_name(PARTS) / digest(made_of)
 
 
 def _part(parts: Path, episode: dict) -> Path:
@@ -205,39 +184,36 @@ def _encode(encoder: FrozenEncoder, images: Tensor, with_patches: bool) -> tuple
     return pooled.cpu().numpy(), tokens.cpu().numpy().astype(np.float16) if with_patches else None
 
 
-def _save(file: Path, array: np.ndarray) -> None:
-    with replaced(file) as partial:
-        np.save(partial, array)
-
-
 def _write_copy(
     dataset: LeRobotDataset,
     camera: str,
-    features: np.ndarray,
+    columns: dict[str, np.ndarray],
+    patches: Sequence[Path],
     info: dict[str, str],
     repo_id: str,
     folder: Path,
-    points: dict[str, np.ndarray],
 ) -> None:
-    key = feature_key(camera)
-    made = {key: features, **points}
-    columns = {name: {"dtype": "float32", "shape": (of.shape[1],), "names": None} for name, of in made.items()}
-    columns[key]["info"] = info
-    if points:
-        columns[point_key(camera)]["names"] = POINT_NAMES
+    """Write a data set's copy with these columns in place of images, and with the patch features of some files."""
+    described = {
+        feature_key(camera): {"names": None, "info": info},
+        point_key(camera): {"names": POINT_NAMES},
+    }
+    features = {
+        name: {"dtype": "float32", "shape": (column.shape[1],), **described[name]} for name, column in columns.items()
+    }
+    read = {name for name in dataset.meta.features if name.startswith(("observation.", "action"))}
+    kept = read - set(dataset.meta.camera_keys) | set(DEFAULT_FEATURES)
+    left_out = [name for name in dataset.meta.features if name not in kept]
     with quiet():
-        added = {name: (of, columns[name]) for name, of in made.items()}
-        copy = modify_features(dataset, added, _left_out(dataset), folder, repo_id)
+        added = {name: (column, features[name]) for name, column in columns.items()}
+        copy = modify_features(dataset, added, left_out, folder, repo_id)
     # LeRobot takes the variance as a difference of squares, which float32 rounds to nothing far from zero.
-    stats = compute_episode_stats({name: of.astype(np.float64) for name, of in made.items()}, columns)
+    stats = compute_episode_stats({name: column.astype(np.float64) for name, column in columns.items()}, features)
     write_stats({**(copy.meta.stats or {}), **stats}, folder)
     _forget_videos(folder)
-
-
-def _left_out(dataset: LeRobotDataset) -> list[str]:
-    read = [name for name in dataset.meta.features if name.startswith(("observation.", "action"))]
-    kept = set(read) - set(dataset.meta.camera_keys) | set(DEFAULT_FEATURES)
-    return [name for name in dataset.meta.features if name not in kept]
+    if patches:
+        _join_files(patches, dataset.num_frames, folder / PATCHES_FILE)
+        bind_patches(folder)
 
 
 def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) -> Iterator[Tensor]:
@@ -255,7 +231,7 @@ def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) 
 
 
 def _forget_videos(root: Path) -> None:
-    """Drop what the copied episode tables still say about videos that the copy does not have."""
+    """Drop the columns of the copied episode tables about videos that the copy does not have."""
     for path in (root / "meta" / "episodes").rglob("*.parquet"):
         table = read_parquet(path).to_pandas()
         gone = [name for name in table if name.startswith(("videos/", "stats/observation.images."))]

@@ -21,7 +21,7 @@ from lerobot_constructskill.features.encode import (
 )
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import describe, feature_key
+from lerobot_constructskill.policies.frozen_vit.feature_sets import describe, feature_key
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights
 
@@ -45,7 +45,7 @@ class Features(Node):
     def facts(self) -> dict[str, Any]:
         config, readout = self.config, READOUTS[self.config.readout]
         spec = get_backbone(config.backbone, config.backbone_path)
-        made_by = describe(spec, config.backbone_sha256, config.backbone_precision, config.crop, config.blind)
+        made_by = describe(spec, config.backbone_sha256, self.precision, config.crop, config.blind)
         return {
             "camera": config.camera,
             "patches": readout.reads_patches,
@@ -73,9 +73,14 @@ class Features(Node):
             )  # says what was tried
             raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
         eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
-        encoder, info = load_encoder(config.backbone, config.backbone_path, config.backbone_precision, *eyes)
+        encoder, info = load_encoder(config.backbone, config.backbone_path, self.precision, *eyes)
         (dataset,) = _opened(self.inputs, inputs)
         write_feature_set(dataset, config.camera, encoder, info, f"local/{self.digest}", folder, **self.beside)
+
+    @property
+    def precision(self) -> str:
+        """What heads are trained in, which a study may set apart from what the policy acts in."""
+        return self.config.backbone_trained_precision or self.config.backbone_precision
 
     @property
     def beside(self) -> dict[str, bool]:

@@ -12,7 +12,8 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features.node import PACKAGES, Features, JoinedFeatures
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import close_patches
+from lerobot_constructskill.policies.frozen_vit.feature_sets import close_patches
+from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
@@ -31,7 +32,7 @@ class FeatureTrainer(Trainer):
     memory. Such seeds are trained side by side.
     """
 
-    places = ("backbone_path", "backbone_source")
+    places = ("backbone_path",)
     packages = PACKAGES
 
     def settle(self, config: FrozenViTChunkConfig) -> list[FrozenViTChunkConfig]:
@@ -76,9 +77,11 @@ class FeatureTrainer(Trainer):
         for seed, policy in zip(seeds, policies, strict=True):
             save_checkpoint(policy, dataset, folder / f"seed_{seed}")
         close_patches()
-        return {config.backbone: _backbone_line(policies[0].config)}
+        return {config.backbone: _backbone_line(policies[0])}
 
 
-def _backbone_line(config: FrozenViTChunkConfig) -> str:
+def _backbone_line(policy: FrozenViTChunkPolicy) -> str:
     """What the backbone is, whose weights are none of the checkpoint's."""
-    return f"{config.backbone_source}, SHA-256 {config.backbone_sha256[:12]}, {config.backbone_precision}"
+    record, precision = policy.encoder_record, policy.config.backbone_precision
+    crossed = f", trained in {record.precision}" if record.precision != precision else ""
+    return f"{record.source}, SHA-256 {record.sha256[:12]}, {precision}{crossed}"

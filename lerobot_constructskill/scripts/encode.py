@@ -23,7 +23,7 @@ class EncodeConfig:
     out_repo_id: RepoId | None = None  # default: <repo_id>_<backbone>
     out_root: Path | None = None  # default: LeRobot's cache
     backbone: str = "dinov2_vits14"  # an entry of `backbones.BACKBONES`, timm/<model>, or hf/<owner>/<name>
-    backbone_path: Text | None = None  # folder or file with the weights; else the Hub, then the [offline] packages
+    backbone_path: Text | None = None  # folder or file with the weights; else the [offline] packages, then the Hub
     backbone_precision: str = "auto"  # auto is the fastest that the device has natively; or float32, bfloat16
     camera: Word = "base"  # observation.images.<camera>
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
@@ -34,13 +34,10 @@ class EncodeConfig:
 
     def __post_init__(self):
         check(self)
-        from lerobot_constructskill.policies.frozen_vit.backbones import check_backbone
-        from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import check_crop
-        from lerobot_constructskill.policies.frozen_vit.precision import check_precision
+        from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 
-        check_backbone(self.backbone)
-        check_precision(self.backbone_precision)
-        check_crop(self.crop)
+        shared = ("backbone", "backbone_path", "backbone_precision", "camera", "crop")
+        FrozenViTChunkConfig(device="cpu", **{name: getattr(self, name) for name in shared})  # refuses what it would
 
 
 def encode(config: EncodeConfig) -> Path:

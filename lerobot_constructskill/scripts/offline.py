@@ -39,9 +39,6 @@ class OfflineConfig:
 SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
 """Columns that are printed; the files have all."""
 
-PRECISION = ("backbone_precision", "backbone_trained_precision")
-"""What frozen_vit's encoder computed in, and in training; they differ where a checkpoint crossed over."""
-
 TYPES = {
     "training_seed": "Int64",
     "rmse_rotation_rad": float,
@@ -103,7 +100,9 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
         "policy": agent.policy.name,
         "training_seed": _training_seed(checkpoint),
         **asdict(offline_metrics(predictions)),
-        **{name: getattr(agent.policy.config, name, None) for name in PRECISION},
+        # Of frozen_vit's encoder, here and in training.
+        "backbone_precision": getattr(agent.policy.config, "backbone_precision", None),
+        "backbone_trained_precision": getattr(getattr(agent.policy, "encoder_record", None), "precision", None),
         "checkpoint": str(checkpoint),
         "weights_sha256": file_sha256(checkpoint / "model.safetensors"),
     }

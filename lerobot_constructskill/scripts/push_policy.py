@@ -40,7 +40,9 @@ def push_policy(config: PushPolicyConfig) -> str:
         if not (config.policy_path / name).is_file():
             raise MissingError(f"{config.policy_path / name} is missing: name a checkpoint's pretrained_model folder.")
     train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), read_facts(config.policy_path, "config.json")
-    section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy)
+    has_record = (config.policy_path / "encoder.json").is_file()
+    encoder = read_facts(config.policy_path, "encoder.json") if has_record else None
+    section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy, encoder)
     with one_sentence(config.repo_id):
         if config.private:
             check_private(config.repo_id)

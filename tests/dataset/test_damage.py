@@ -95,7 +95,7 @@ def test_a_hostile_set_gets_no_card(pristine: Path, change) -> None:
 def test_a_policys_card_escapes_what_its_files_say(tmp_path: Path) -> None:
     hostile = "x`\n# Heading <script>[a](javascript:b)"
     train = {"seed": 0, "dataset": {"repo_id": hostile, "revision": hostile}}
-    card = render_outcomes([(0, 1, 1, 1)], "brick_to_bin", train, {"backbone": hostile})
+    card = render_outcomes([(0, 1, 1, 1)], "brick_to_bin", train, {"backbone": hostile}, {"source": hostile})
     assert "<script>" not in card and "](" not in card and "\n# Heading" not in card
 
 

@@ -14,7 +14,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.artifacts.folders import MARK
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import load_encoder
 from lerobot_constructskill.features.points import POSES, find_points
@@ -23,9 +23,8 @@ from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
-from lerobot_constructskill.policies.frozen_vit.features import PATCHES_FILE, close_patches, open_patches
-from lerobot_constructskill.policies.frozen_vit.weights import state_sha256
-from lerobot_constructskill.policies.frozen_vit.wheels import Wheel
+from lerobot_constructskill.policies.frozen_vit.feature_sets import PATCHES_FILE, close_patches, open_patches
+from lerobot_constructskill.policies.frozen_vit.weights import Wheel
 from lerobot_constructskill.scripts.encode import EncodeConfig, encode
 
 KEY = "observation.features.base"
@@ -267,21 +266,21 @@ def test_features_of_a_precision_that_is_missing_here_are_refused_unless_another
     monkeypatch.setattr(precision, "_cpu_multiplies_bfloat16", lambda: False)
     with pytest.raises(ValueError, match="only emulate bfloat16"):
         make_policy(policy_config(weights), ds_meta=meta)
-    crossing = make_policy(policy_config(weights, backbone_precision="float32"), ds_meta=meta).config
-    assert (crossing.backbone_precision, crossing.backbone_trained_precision) == ("float32", "bfloat16")
+    crossing = make_policy(policy_config(weights, backbone_precision="float32"), ds_meta=meta)
+    assert (crossing.backbone.precision, crossing.encoder_record.precision) == ("float32", "bfloat16")
 
 
 def test_features_of_other_weights_are_refused(encoded, tmp_path):
     torch.manual_seed(1)
     save_file(BACKBONES["vit_tiny16"].build().state_dict(), tmp_path / "other.safetensors")
-    with pytest.raises(ValueError, match="weights_sha256"):
+    with pytest.raises(ValueError, match="weights asked for have sha256 .* but local other.safetensors has"):
         make_policy(policy_config(tmp_path / "other.safetensors"), ds_meta=encoded.meta)
 
 
 def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, monkeypatch):
     """Both sources are faked by local files: a Hub with other weights, and a wheel with those that encoded."""
     state = load_file(weights)
-    wheel = Wheel("a-package", "1", ("torch",), state_sha256(state), lambda folder: state)
+    wheel = Wheel("a-package", ("torch",), "file", lambda file: state)
     spec = replace(BACKBONES["vit_tiny16"], wheel=wheel)
     monkeypatch.setitem(BACKBONES, "vit_tiny16", spec)
     torch.manual_seed(1)
@@ -289,10 +288,10 @@ def test_training_takes_the_weights_that_encoded(encoded, weights, tmp_path, mon
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: tmp_path / "other.safetensors")
     monkeypatch.setattr(weights_module, "version", lambda distribution: "0")
     policy = make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
-    assert policy.config.backbone_source == "a-package 0 wheel"
-    assert policy.config.backbone_sha256 == encoded.meta.features[KEY]["info"]["weights_sha256"]
+    assert policy.encoder_record.source == "a-package 0 wheel"
+    assert policy.encoder_record.sha256 == encoded.meta.features[KEY]["info"]["weights_sha256"]
     monkeypatch.setitem(BACKBONES, "vit_tiny16", replace(spec, wheel=None))
-    with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
+    with pytest.raises(ValueError, match="weights asked for have sha256 .* but hub"):
         make_policy(FrozenViTChunkConfig(backbone="vit_tiny16", device="cpu"), ds_meta=encoded.meta)
 
 
@@ -304,7 +303,7 @@ def test_features_of_pretrained_weights_are_not_those_of_random_ones(encoded, we
     asked = FrozenViTChunkConfig(
         backbone="vit_tiny16", backbone_path=str(weights), backbone_pretrained=False, device="cpu"
     )
-    with pytest.raises(ValueError, match="not made by this policy's encoder: weights_sha256"):
+    with pytest.raises(ValueError, match="weights asked for have sha256 .* but random, seed 0 has"):
         make_policy(asked, ds_meta=encoded.meta)
 
 
@@ -336,7 +335,7 @@ def test_an_interrupted_run_continues_with_its_next_episode(patches, source, wei
 
 @pytest.mark.parametrize("fields", [{"backbone": "resnet18"}, {"camera": "top"}, {"batch_size": 0}])
 def test_nonsense_leaves_nothing_behind(fields, source, weights, tmp_path):
-    with pytest.raises(ValueError, match="backbones are|cameras are|batch_size must be"):
+    with pytest.raises(UserError, match="backbones are|cameras are|batch_size must be"):
         encode(settings(source, weights, tmp_path / "out", **fields))
     assert not list(tmp_path.iterdir())
 
@@ -366,7 +365,7 @@ def test_a_backbone_without_weights_is_told_that_the_features_are_anothers(encod
 
 def test_a_study_takes_the_weights_whose_hash_it_names_or_none(weights):
     settle = FeatureTrainer().settle
-    found = settle(policy_config(weights)).backbone_sha256
-    assert settle(policy_config(weights, backbone_sha256=found)).backbone_sha256 == found
+    found = settle(policy_config(weights))[0].backbone_sha256
+    assert settle(policy_config(weights, backbone_sha256=found))[0].backbone_sha256 == found
     with pytest.raises(InputError, match="weights asked for have sha256 000000000000, but local tiny.safetensors has"):
         settle(policy_config(weights, backbone_sha256="0" * 64))

@@ -14,7 +14,7 @@ from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
-from lerobot_constructskill.policies.frozen_vit.shared_eyes import POOLED
+from lerobot_constructskill.policies.frozen_vit.shared_encoder import POOLED
 
 TINY = "vit_tiny16"
 

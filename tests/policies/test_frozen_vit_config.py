@@ -36,6 +36,8 @@ STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
         ({"readout": "max"}, "cls, mean, cls_mean, spatial_softmax, attention, heat_maps"),
         ({"readout": "mean", "standardize_features": True}, "readout=cls only, not mean"),
         ({"regression_weight": 0}, "above 0 .* not 0"),
+        ({"readout": "spatial_softmax", "point_weight": 2.0}, "readout=spatial_softmax finds none"),
+        ({"backbone_sha256": "0" * 12}, "64 hexadecimal digits"),
         ({"scheduler_warmup_steps": -1}, "from 0 to .* not -1"),
         ({"regression_weight": math.nan}, "regression_weight must be a finite number above 0 .* not nan"),
         ({"temporal_ensemble_coeff": math.nan}, "not nan"),

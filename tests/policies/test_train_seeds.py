@@ -1,23 +1,17 @@
 """Seeds trained together are the seeds trained alone, and end as LeRobot checkpoints."""
 
-from concurrent.futures import Future
-from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from safetensors.torch import load_file
 
-from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.features import trainer
-from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.training.trainers import policy_spec
+from lerobot_constructskill.rollout.heldout import heldout_mse
 
 EPOCHS, BATCH_SIZE = 3, 16
 HELD_OUT = [3, 7]
@@ -83,12 +77,6 @@ def test_heat_maps_are_not_trained_without_points(config, feature_set):
         train_seeds(config(readout="heat_maps"), untold, [0], **TRAINING)
 
 
-@pytest.mark.parametrize(("readout", "shows"), [("spatial_softmax", False), ("heat_maps", True)])
-def test_a_weight_that_nothing_is_weighed_by_makes_no_other_checkpoint(readout, shows, config):
-    one, other = (policy_spec(config(readout=readout, point_weight=weight)) for weight in (1.0, 2.0))
-    assert (one != other) == shows
-
-
 @pytest.fixture
 def threads():
     """Put the number of torch's threads back."""
@@ -108,67 +96,6 @@ def test_weights_do_not_depend_on_the_number_of_cores(readout, config, feature_s
     assert all(torch.equal(trained[0][name], trained[1][name]) for name in trained[0])
 
 
-def fit(config, feature_set, seeds, folder, monkeypatch, beside=()):
-    """What a study has its trainer do, on features that are there: the weights of every seed, as they were written.
-
-    Args:
-        beside: seeds of the same stack that nobody asked for.
-    """
-    monkeypatch.setattr(trainer, "obtain_features", lambda *_: feature_set)
-    written = {}
-
-    @contextmanager
-    def write(seed, **facts):
-        yield folder / str(seed)
-        written[seed] = load_file(folder / str(seed) / "model.safetensors"), facts["heldout_mse_m2"]
-
-    writers = {seed: partial(write, seed) for seed in seeds} | dict.fromkeys(beside)
-    FeatureTrainer().fit(config, feature_set, writers, EPOCHS, BATCH_SIZE, HELD_OUT, Store(folder / "store"))
-    return written
-
-
-def test_what_is_missing_of_a_stack_shows_in_nothing(config, feature_set, tmp_path, monkeypatch):
-    """Bit for bit: all ten are trained whenever one of them is."""
-    whole = fit(config(), feature_set, range(10), tmp_path / "whole", monkeypatch)
-    rest = fit(config(), feature_set, [4, 7], tmp_path / "rest", monkeypatch, beside={*range(10)} - {4, 7})
-    assert rest.keys() == {4, 7}
-    for seed, (weights, error) in rest.items():
-        assert error == whole[seed][1] and all(torch.equal(one, whole[seed][0][name]) for name, one in weights.items())
-
-
-@pytest.mark.slow
-def test_seeds_side_by_side_are_the_seeds_one_after_another(config, feature_set, tmp_path, monkeypatch):
-    learns = config(readout="spatial_softmax", save_backbone=False)
-    monkeypatch.setattr(trainer, "cores", lambda: 2)
-    beside = fit(learns, feature_set, [3, 0], tmp_path / "beside", monkeypatch)
-    monkeypatch.setattr(trainer, "cores", lambda: 1)
-    after = fit(learns, feature_set, [3, 0], tmp_path / "after", monkeypatch)
-    assert list(beside) == list(after) == [3, 0]
-    for seed, (weights, error) in beside.items():
-        assert error == after[seed][1] and all(torch.equal(weights[name], after[seed][0][name]) for name in weights)
-
-
-def test_a_seed_that_fails_does_not_keep_those_beside_it(config, feature_set, tmp_path, monkeypatch):
-    """The pool stands in for processes, in which nothing can be replaced."""
-
-    @contextmanager
-    def pool(executor, workers):
-        def submit(function, config, repo_id, root, seed, recipe):
-            future = Future()
-            future.set_exception(ValueError("of seed 3")) if seed == 3 else future.set_result(
-                function(config, repo_id, root, seed, recipe)
-            )
-            return future
-
-        yield submit
-
-    monkeypatch.setattr(trainer, "open_pool", pool)
-    monkeypatch.setattr(trainer, "cores", lambda: 2)
-    with pytest.raises(ValueError, match="of seed 3"):
-        fit(config(readout="attention", save_backbone=False), feature_set, [3, 0], tmp_path, monkeypatch)
-    assert (tmp_path / "0" / "model.safetensors").is_file() and not (tmp_path / "3").exists()
-
-
 def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monkeypatch):
     """With a bound that every step exceeds, the parity above holds only if no seed's norm reaches another's."""
     from lerobot.optim import AdamWConfig
@@ -183,12 +110,15 @@ def test_gradients_are_clipped_for_each_seed_by_itself(config, feature_set, monk
 
 @pytest.mark.parametrize("fields", [{}, {"use_state": True}, {"readout": "attention"}], ids=str)
 @pytest.mark.parametrize("validation", ["feature_set", "other_set"])
-def test_the_held_out_error_is_that_of_every_fourth_episode(validation, fields, config, feature_set, request):
+def test_the_held_out_error_is_that_of_every_fourth_episode(
+    validation, fields, config, feature_set, request, tmp_path
+):
     """Of the training set or of another, which is normalised as the training set was."""
     policies = train_seeds(config(**fields), feature_set, [0], **TRAINING)
     dataset, stats = request.getfixturevalue(validation), feature_set.meta.stats
     preprocess, _ = make_pre_post_processors(policies[0].config, dataset_stats=stats)
-    (measured,) = heldout_mse(policies, dataset, HELD_OUT, preprocess)
+    save_checkpoint(policies[0], feature_set, tmp_path)
+    measured = heldout_mse(tmp_path, dataset, HELD_OUT)
     items = [
         item for item in chunked(dataset, policies[0].config.chunk_size) if int(item["episode_index"]) in HELD_OUT
     ]
@@ -198,23 +128,20 @@ def test_the_held_out_error_is_that_of_every_fourth_episode(validation, fields, 
     assert measured == pytest.approx(error.pow(2).mean().item(), rel=1e-5)
 
 
-def test_without_a_held_out_episode_there_is_no_error(config, feature_set):
-    policies = train_seeds(config(), feature_set, [0], epochs=1, batch_size=16)
-    assert heldout_mse(policies, feature_set, [], lambda batch: batch) == [None]
-
-
-def test_the_held_out_error_of_a_checkpoint_from_a_gpu_is_measured_here(config, feature_set, tmp_path, monkeypatch):
-    """There is none: its files say that it was. The features are there, so that nothing is encoded."""
-    fields = config(use_state=True)
-    (policy,) = train_seeds(fields, feature_set, [0], **TRAINING)
+def test_without_a_held_out_episode_there_is_no_error(config, feature_set, tmp_path):
+    (policy,) = train_seeds(config(), feature_set, [0], epochs=1, batch_size=16)
     save_checkpoint(policy, feature_set, tmp_path)
+    assert heldout_mse(tmp_path, feature_set, []) is None
+
+
+def test_the_held_out_error_of_a_checkpoint_from_a_gpu_is_measured_here(config, feature_set, tmp_path):
+    """There is none: its files say that it was."""
+    (policy,) = train_seeds(config(use_state=True), feature_set, [0], **TRAINING)
+    save_checkpoint(policy, feature_set, tmp_path)
+    before = heldout_mse(tmp_path, feature_set, HELD_OUT)
     path = tmp_path / "policy_preprocessor.json"
     path.write_text(path.read_text().replace('"device": "cpu"', '"device": "cuda"'))
-    assert "cuda" in path.read_text()
-    monkeypatch.setattr(trainer, "obtain_features", lambda *_: feature_set)
-    (measured,) = FeatureTrainer().heldout_mse(fields, [tmp_path], feature_set, HELD_OUT, Store(tmp_path / "store"))
-    preprocess, _ = make_pre_post_processors(policy.config, dataset_stats=feature_set.meta.stats)
-    assert measured == pytest.approx(heldout_mse([policy], feature_set, HELD_OUT, preprocess)[0], rel=1e-5)
+    assert "cuda" in path.read_text() and heldout_mse(tmp_path, feature_set, HELD_OUT, device="cpu") == before
 
 
 def test_a_checkpoint_is_lerobots_own_and_acts_alike(config, feature_set, tmp_path):

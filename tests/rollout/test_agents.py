@@ -10,7 +10,7 @@ import torch
 from lerobot.policies.factory import make_policy_config
 
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.policies.frozen_vit.shared_eyes import BATCH, _Memory
+from lerobot_constructskill.policies.frozen_vit.shared_encoder import BATCH, FrameCache
 from lerobot_constructskill.rollout.agents import Lockstep, Observation, PolicyAgent
 
 SEEN = Observation({"pixels": {"base": np.zeros((1, 8, 8, 3), np.uint8)}}, {}, "put it there")
@@ -88,8 +88,8 @@ def test_a_gpu_always_encodes_as_many_frames_at_once(new):
         given.append(len(batch))
         return batch.flatten(1)
 
-    memory = _Memory(SimpleNamespace(pool=pool, backbone=SimpleNamespace(runtime="torch")))
-    encoded = memory._encode([torch.empty(1, 3, 4, 4, device="meta")] * new)
+    memory = FrameCache(SimpleNamespace(pool=pool, backbone=SimpleNamespace(runtime="torch")))
+    encoded = memory.encode([torch.empty(1, 3, 4, 4, device="meta")] * new)
     assert {*given} == {BATCH} and len(encoded) == new and encoded[0].shape == (1, 48)
 
 

@@ -90,7 +90,7 @@ def their_package(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def study_file(tmp_path_factory, tiny_weights):
-    """Two seeds of a tiny policy, one that cannot be had, every reference but the costliest, and others' things."""
+    """Two seeds of two tiny policies, one that cannot be had, all references but the costliest, and others' things."""
     tiny = {"type": "frozen_vit", "backbone": "vit_tiny16", "backbone_path": str(tiny_weights)}
     env = {"task": "brick_to_bin", "episode_length": 8, "obs_type": "pixels_agent_pos"}
     study = {
@@ -98,6 +98,7 @@ def study_file(tmp_path_factory, tiny_weights):
         "settings": {"fixed": {"data": "smoke", "env": env}},
         "variants": {
             "tiny": {"policy": tiny, "seeds": 2},
+            "learns": {"policy": tiny | {"readout": "attention"}, "seeds": 2},
             "act": {"policy": ACT | {"use_vae": False}, "seeds": 1},
             "theirs": {"policy": ACT | {"use_vae": False, "type": "late_act"}, "seeds": 1},
             "absent": {"policy": tiny | {"backbone_path": "/no/such/weights"}, "seeds": 2},
@@ -175,10 +176,11 @@ def test_killed_at_any_stage_it_ends_as_the_undisturbed_one(start, finish, undis
 
 @pytest.mark.nightly
 def test_a_seed_after_another_ends_as_both_at_once(finish, undisturbed, tmp_path):
-    """Rows hold the hashes of demonstrations and weights."""
-    finish(tmp_path, "--seeds=1", "--only=fixed/tiny")
-    made = finish(tmp_path, "--only=fixed/tiny")
-    both = (rows[rows["variant"] == "tiny"].reset_index(drop=True) for rows in (made, undisturbed))
+    """In one computation, or side by side in two processes. Rows hold the hashes of demonstrations and weights."""
+    some = "--only=fixed/tiny,fixed/learns"
+    finish(tmp_path, "--seeds=1", some)
+    made = finish(tmp_path, some)
+    both = (rows[rows["variant"].isin(["tiny", "learns"])].reset_index(drop=True) for rows in (made, undisturbed))
     pd.testing.assert_frame_equal(*both)
 
 
@@ -187,7 +189,7 @@ def test_the_rows_say_what_happened(undisturbed):
     assert set(undisturbed["variant"]) - set(finished["variant"]) == {"absent"}, list(undisturbed["error"].dropna())
     counts = finished.groupby("variant").size().to_dict()
     references = {"no_op": 2, "random": 4, "replay": 2, "blind": 2, "expert": 2, "late_expert": 2}
-    assert counts == {"tiny": 4, "act": 2, "theirs": 2} | references
+    assert counts == {"tiny": 4, "learns": 4, "act": 2, "theirs": 2} | references
     assert set(finished["steps"]) == {8} and set(finished["evaluation_seed"]) == {1000, 1001}
     assert finished["backend"].str.startswith("physx_cpu").all() and finished["final_error_m"].between(0.1, 1).all()
     assert set(undisturbed.loc[undisturbed["role"] == "sightless", "variant"]) == {"replay", "blind"}
@@ -204,7 +206,7 @@ def test_the_rows_say_what_happened(undisturbed):
     failed = undisturbed[undisturbed["error_kind"].notna()]
     assert list(failed["variant"]) == ["absent"] * 2 and failed["lifted"].isna().all()
     assert set(failed["error_kind"]) == {"weights"} and failed["error"].str.contains("/no/such/weights").all()
-    assert undisturbed["dataset_sha256"].nunique() == 1 and undisturbed["run"].nunique() == 13
+    assert undisturbed["dataset_sha256"].nunique() == 1 and undisturbed["run"].nunique() == 15
 
 
 def test_a_run_is_a_folder_with_all_that_belongs_to_it(undisturbed, folder):
@@ -212,7 +214,7 @@ def test_a_run_is_a_folder_with_all_that_belongs_to_it(undisturbed, folder):
         row, own = next(rows.itertuples()), folder / "store" / "runs" / run
         assert json.loads((own / "spec.json").read_text())["evaluation"] == {"seed": 1000, "episodes": 2}
         failed, filmed = pd.notna(row.error_kind), pd.notna(row.video)
-        trained = row.variant in ("tiny", "act", "theirs", "blind")
+        trained = row.variant in ("tiny", "learns", "act", "theirs", "blind")
         assert (own / "checkpoint" / "model.safetensors").is_file() == trained
         assert (own / "video.mp4").exists() == filmed == (row.training_seed == 0 and not failed)
         assert not filmed or (folder / "study" / row.video).stat().st_size > 1000

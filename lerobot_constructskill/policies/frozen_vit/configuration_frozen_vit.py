@@ -11,30 +11,23 @@ from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, che
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
-from .backbone import IMAGE_SIZE
-from .backbones import check_backbone
-from .features import feature_key, point_key
-from .heads import REGRESSION_LOSSES
-from .precision import AUTO, PRECISIONS, RUNTIMES
+from .backbones import IMAGE_SIZE, check_backbone
+from .feature_sets import feature_key, point_key
+from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
 TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
 GRIPPER_NAME = "gripper"
 GRIPPER_HEADS = ("bce", "regression")
+REGRESSION_LOSSES = ("mse", "l1")
 
 LARGEST_EXPONENT = 80
-"""Of a weight in temporal ensembling: exp(88) is the last that float32 holds."""
+"""Largest exponent of a weight in temporal ensembling: float32 holds no more than exp(88)."""
 
 ChunkSize = Annotated[int, Range(1, 1000, unit="steps")]
-Width = Annotated[int, Range(1, 65_536)]
-Scale = Annotated[float, Range(above=0, most=10, unit="m and rad")]
 Logit = Annotated[float, Range(-100, 100)]
 Weight = Annotated[float, Range(above=0, most=1e9)]
-Rate = Annotated[float, Range(above=0, most=10)]
-Decay = Annotated[float, Range(0, 10)]
-DeviceName = Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, mps, xpu")]
-Edge = Annotated[float, Range(0, 1)]
 
 
 @PreTrainedConfig.register_subclass("frozen_vit")
@@ -50,18 +43,17 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         n_action_steps: steps taken from a chunk before the next one; 1 with temporal ensembling.
         backbone: an entry of `backbones.BACKBONES`, or any model of timm as `timm/<model>` and of transformers as
             `hf/<owner>/<name>`; `@<commit>` at the end pins a version on the Hub.
-        backbone_path: folder or file with the weights; None looks at the Hub, then at installed packages that hold
-            them. So does a checkpoint (or a feature set) that knows their hash, if the path does not exist.
-        backbone_pretrained: False draws the weights of the same architecture at random, to measure what it gives.
-        backbone_source: written by the policy: where the weights came from.
-        backbone_sha256: written by the policy: hash of the weights, taken when they are first loaded (on a feature
-            set, they must be those that made it) and checked whenever the checkpoint is loaded.
-        backbone_precision: what the backbone computes in: "float32", "bfloat16", or "auto", which becomes that of the
-            feature set, or without one the fastest that the device has natively.
-        backbone_trained_precision: written by the policy: the precision of the features that the heads learn from. If
-            `backbone_precision` is another one, the log says so, with the drift of the features.
-        backbone_trained_runtime: written by the policy: what computed these features, "openvino" (a CPU) or "torch".
-            If it was OpenVINO and the policy acts on another device than a CPU, the log says so in the same way.
+        backbone_path: folder or file with the weights; None looks for an installed package that holds them, then at
+            the Hub. So does a checkpoint (or a feature set) that knows their hash, if the path does not exist.
+        backbone_pretrained: False draws the weights of the same architecture at random, to measure what pretraining
+            gives.
+        backbone_sha256: hash that the weights must have; None takes the backbone's known one, or where none is known
+            the weights that are found. A checkpoint records their hash in `encoder.json` and checks it on every load.
+        backbone_precision: number format that the backbone computes in: "float32", "bfloat16", or "auto", which
+            becomes the feature set's, or without one the fastest that the device has natively.
+        backbone_trained_precision: number format of the features that a study trains the heads on; None for
+            `backbone_precision`. A feature set and a checkpoint say their own. Where a policy acts on features of
+            another one, the log says so, with the drift of the features.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source of weights.
         camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
@@ -70,7 +62,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         readout: what the heads see of the encoder's tokens, one of `readouts.READOUTS`: "cls" (the paper's pooled
             feature), the "mean" of the patches, both ("cls_mean"), where K learned patterns are
             ("spatial_softmax"), what a few learned queries find ("attention"), or where the object, the receptacle and
-            the hand are ("heat_maps"). On a feature set all but the first need its patch features, and the last learns
+            the hand are ("heat_maps"). On a feature set all but "cls" need its patch features, and "heat_maps" learns
             from its points.
         standardize_features: whether each feature is standardised by the data set's mean and deviation. The linear
             heads can express the same functions either way (the paper's is False), but Adam needs far fewer
@@ -92,21 +84,21 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         temporal_ensemble_coeff: LeRobot's, with ACT's sign: the i-th chunk from the oldest has weight
             exp(-coeff * i). -0.1 is the paper's exp(-0.1 k), where k is the steps since a chunk was predicted: the
             newest has most weight. None takes the newest chunk's first action.
-        regression_loss: what a translation's error costs: "mse", its square as in the paper, or "l1", its absolute
+        regression_loss: cost of a translation's error: "mse", its square as in the paper, or "l1", its absolute
             value as in ACT, whose slope does not vanish in the last millimetres.
         regression_weight: weight of the translations' loss (a squared error of about 1e-4 m2, an absolute one of
             about 3e-3 m) relative to the gripper's. It matters only with a readout that learns, because both heads
             then share its parameters.
         point_weight: weight of the error of the points that the readout finds (half the image is 1) relative to the
-            gripper's loss; only with a readout that finds points.
+            gripper's loss. Only a readout that finds points takes another one than 1.
         scheduler_warmup_steps: steps of linear warm-up, after which the learning rate falls to zero along a cosine.
             None keeps it constant.
     """
 
     study_trainer: ClassVar[str] = "lerobot_constructskill.features.trainer:FeatureTrainer"
-    """What trains it in a study, a `training.trainers.Trainer`: many seeds at once, on features encoded once."""
+    """The `training.trainers.Trainer` of a study: many seeds at once, on features encoded once."""
 
-    device: DeviceName | None = None
+    device: Annotated[str, Pattern(r"cpu|mps|xpu|cuda(:\d{1,3})?", "one of cpu, cuda, mps, xpu")] | None = None
     n_obs_steps: Annotated[int, Range(1, 1)] = 1
     chunk_size: ChunkSize = 8
     n_action_steps: ChunkSize = 1
@@ -122,71 +114,80 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone: Text = "dinov2_vits14"
     backbone_path: Text | None = None
     backbone_pretrained: bool = True
-    backbone_source: str | None = None
-    backbone_sha256: str | None = None
+    backbone_sha256: Annotated[str, Pattern("[0-9a-f]{64}", "64 hexadecimal digits")] | None = None
     backbone_precision: Annotated[str, Among((AUTO, *PRECISIONS))] = AUTO
     backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
-    backbone_trained_runtime: Annotated[str, Among(RUNTIMES)] | None = None
     save_backbone: bool = True
     camera: Word = "base"
-    crop: list[Edge] | None = None
+    crop: list[Annotated[float, Range(0, 1)]] | None = None
     blind: bool = False
     readout: Annotated[str, Among(tuple(READOUTS))] = "cls"
     standardize_features: bool = False
     use_state: bool = False
-    head_hidden_dim: Width | None = None
+    head_hidden_dim: Annotated[int, Range(1, 65_536)] | None = None
     head_hidden_layers: Annotated[int, Range(1, 16)] = 1
 
     fps: Annotated[int, Range(1, 1000, unit="Hz")] = 20
     action_names: list[str] = field(default_factory=lambda: [*TRANSLATION_NAMES, GRIPPER_NAME])
-    action_scale: Scale = 0.1
+    action_scale: Annotated[float, Range(above=0, most=10, unit="m and rad")] = 0.1
     gripper_head: Annotated[str, Among(GRIPPER_HEADS)] = "bce"
     gripper_threshold: Logit = 0.5
     temporal_ensemble_coeff: Logit | None = -0.1
 
-    regression_loss: Annotated[str, Among(tuple(REGRESSION_LOSSES))] = "mse"
+    regression_loss: Annotated[str, Among(REGRESSION_LOSSES)] = "mse"
     regression_weight: Weight = 1.0
     point_weight: Weight = 1.0
-    optimizer_lr: Rate = 1e-3
-    optimizer_weight_decay: Decay = 1e-2
+    optimizer_lr: Annotated[float, Range(above=0, most=10)] = 1e-3
+    optimizer_weight_decay: Annotated[float, Range(0, 10)] = 1e-2
     scheduler_warmup_steps: Annotated[int, Range(0, 100_000_000, unit="steps")] | None = None
 
     def __post_init__(self) -> None:
         with heard_by_lerobot():
             self._check()
         super().__post_init__()
-        self._feature_column: dict[str, Any] | None = None
+        # Entry of the encoded frames in the data set's `features`, None where it has images; no field of a checkpoint.
+        self.feature_column: dict[str, Any] | None = None
 
     def _check(self) -> None:
         check(self)
         check_backbone(self.backbone)
-        check_crop(self.crop)
-        if self.standardize_features and self.readout != "cls":
-            raise InputError(
-                f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
-                "set are those of its pooled feature."
-            )
+        _check_crop(self.crop)
         _check_action_names(self.action_names)
-        untouched = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
-        if not untouched.items() <= self.normalization_mapping.items():
-            raise InputError(
+        identity = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
+        coeff = self.temporal_ensemble_coeff
+        conflicts = (
+            (
+                self.standardize_features and self.readout != "cls",
+                f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
+                "set are those of its pooled feature.",
+            ),
+            (
+                self.point_weight != 1 and not READOUTS[self.readout].points,
+                f"point_weight weighs points, and readout={self.readout} finds none: leave it at 1.",
+            ),
+            (
+                not identity.items() <= self.normalization_mapping.items(),
                 "normalization_mapping must have IDENTITY for VISUAL and ACTION: the backbone has pixel statistics of "
-                "its own, and actions are in metres."
-            )
-        if self.n_action_steps > self.chunk_size:
-            raise InputError(
-                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}."
-            )
-        if abs(self.temporal_ensemble_coeff or 0) * self.chunk_size > LARGEST_EXPONENT:
-            raise InputError(
+                "its own, and actions are in metres.",
+            ),
+            (
+                self.n_action_steps > self.chunk_size,
+                f"n_action_steps must be between 1 and chunk_size={self.chunk_size}, not {self.n_action_steps}.",
+            ),
+            (
+                abs(coeff or 0) * self.chunk_size > LARGEST_EXPONENT,
                 f"temporal_ensemble_coeff must be within {LARGEST_EXPONENT / self.chunk_size:g} of 0 with "
-                f"chunk_size={self.chunk_size}, not {self.temporal_ensemble_coeff}: weights would overflow."
-            )
-        if self.temporal_ensemble_coeff is not None and self.n_action_steps != 1:
-            raise InputError(
+                f"chunk_size={self.chunk_size}, not {coeff}: weights would overflow.",
+            ),
+            (
+                coeff is not None and self.n_action_steps != 1,
                 f"n_action_steps must be 1 with temporal ensembling, got {self.n_action_steps}; set "
-                "temporal_ensemble_coeff=null to take several steps of one chunk."
-            )
+                "temporal_ensemble_coeff=null to take several steps of one chunk.",
+            ),
+        )
+        for is_conflict, reason in conflicts:
+            if is_conflict:
+                raise InputError(reason)
 
     @property
     def image_key(self) -> str:
@@ -200,16 +201,6 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     def point_key(self) -> str:
         return point_key(self.camera)
 
-    @property
-    def losses(self) -> dict[str, str]:
-        """What errors cost, as `heads.chunk_errors` takes it."""
-        return {"gripper_head": self.gripper_head, "regression_loss": self.regression_loss}
-
-    @property
-    def feature_column(self) -> dict[str, Any] | None:
-        """Entry of the encoded frames in the data set's `features`, or None where it has images."""
-        return self._feature_column
-
     def set_dataset_feature_metadata(self, features: dict[str, dict]) -> None:
         """Take action names and the description of encoded frames from a data set; `make_policy` calls this.
 
@@ -222,15 +213,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         if self.pretrained_path and names != self.action_names:
             raise InputError(f"The checkpoint acts in {self.action_names}, but the data set's actions are {names}.")
         self.action_names = names
-        self._feature_column = features.get(self.feature_key)
-
-    def check_rate(self, fps: int) -> None:
-        """Refuse a data set of another rate, in frames a second, than the policy acts at."""
-        if fps != self.fps:
-            raise InputError(
-                f"The data set has {fps} frames a second and the policy acts at {self.fps} Hz: train on a set of that "
-                "rate, or set fps if what it is for runs at another."
-            )
+        self.feature_column = features.get(self.feature_key)
 
     def validate_features(self) -> None:
         """Narrow inputs to the one camera (and state) and outputs to `action`.
@@ -262,9 +245,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return AdamWConfig(lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay)
 
     def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig | None:
-        if self.scheduler_warmup_steps is None:
-            return None
-        return CosineAnnealingWithWarmupSchedulerConfig(self.scheduler_warmup_steps)
+        steps = self.scheduler_warmup_steps
+        return None if steps is None else CosineAnnealingWithWarmupSchedulerConfig(steps)
 
     @property
     def observation_delta_indices(self) -> None:
@@ -279,12 +261,12 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return None
 
 
-def check_crop(crop: list[float] | None) -> None:
+def _check_crop(crop: list[float] | None) -> None:
     """Refuse edges that enclose no pixels of an image."""
     if crop is None:
         return
     left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
-    least = 2 / IMAGE_SIZE  # of one pixel nothing may be left, where its edges are rounded
+    least = 2 / IMAGE_SIZE  # rounding its edges may leave nothing of a single pixel
     if not (0 <= left <= right - least <= 1 - least and 0 <= top <= bottom - least <= 1 - least):
         raise InputError(
             f"crop must be left, top, right and bottom in shares of the image, at least two pixels of "
@@ -294,14 +276,8 @@ def check_crop(crop: list[float] | None) -> None:
 
 def _check_action_names(names: Any) -> None:
     known = (*TRANSLATION_NAMES, *ROTATION_NAMES)
-    served = (
-        isinstance(names, list)
-        and len(names) > 1
-        and names[-1] == GRIPPER_NAME
-        and len(set(names)) == len(names)
-        and set(names[:-1]) <= set(known)
-    )
-    if not served:
+    moves = names[:-1] if isinstance(names, list) and names[-1:] == [GRIPPER_NAME] else []
+    if not moves or len(set(moves)) < len(moves) or not set(moves) <= set(known):
         raise InputError(
             f"action_names must be one or more of {', '.join(known)}, each once, and then '{GRIPPER_NAME}', "
             f"not {names}."

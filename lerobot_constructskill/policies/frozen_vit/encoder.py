@@ -1,22 +1,45 @@
 """Pixels in, one feature vector out: a backbone that never trains."""
 
 from collections.abc import Sequence
-from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from lerobot_constructskill.files import Json
+
 from . import openvino
-from .backbone import IMAGE_SIZE, Backbone
+from .backbones import IMAGE_SIZE, Backbone
 from .precision import computing_in, is_native
 
 GREY = 0.5
-"""What a blind encoder sees, in every pixel."""
+"""Value of every pixel that a blind encoder sees."""
 
 Crop = Sequence[float]
 """Left, top, right and bottom edge of the part of an image that is looked at, in shares of its width and height."""
+
+
+@dataclass(frozen=True)
+class EncoderRecord:
+    """What a checkpoint says of its encoder, in `encoder.json` beside its weights. The policy writes it.
+
+    Args:
+        source: where the backbone's weights came from.
+        sha256: hash of these weights. It is checked whenever the checkpoint is loaded.
+        precision: number format of the features that the heads learned from.
+        runtime: what computed these features, OpenVINO (on a CPU) or PyTorch; None where a feature set does not say.
+    """
+
+    source: str | None = None
+    sha256: str | None = None
+    precision: Literal["float32", "bfloat16"] | None = None
+    runtime: Literal["openvino", "torch"] | None = None
+
+
+RECORD_FILE = "encoder.json"
+RECORD = Json("the record of a policy's encoder", EncoderRecord)
 
 
 class FrozenEncoder(nn.Module):
@@ -44,7 +67,6 @@ class FrozenEncoder(nn.Module):
         self.register_buffer("mean", torch.tensor(backbone.mean).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(backbone.std).view(1, 3, 1, 1), persistent=False)
         self._compiled: openvino.OpenVINOEncoder | None = None
-        self._of_grey: tuple[Tensor, Tensor] | None = None
         self.model.register_load_state_dict_post_hook(self._forget_compiled)  # a method, so that a copy has its own
         self.train(False)
 
@@ -55,7 +77,8 @@ class FrozenEncoder(nn.Module):
     @property
     def runtime(self) -> str:
         """What computes the features on this machine."""
-        return "openvino" if self._is_compiled_for(self.device) else "torch"
+        on_cpu = self.device.type == "cpu" and openvino.is_installed() and is_native(self.precision, self.device)
+        return "openvino" if on_cpu else "torch"
 
     def train(self, mode: bool = True) -> "FrozenEncoder":
         return super().train(False)
@@ -74,46 +97,23 @@ class FrozenEncoder(nn.Module):
     @torch.no_grad()
     def encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pooled features (B, D) and the patch features (B, N, D) of images, float32."""
-        if not self.blind:
-            return self._encode(images)
-        if self._of_grey is None:
-            self._of_grey = self._encode(torch.full_like(images[:1].float(), GREY))
-        return tuple(tokens.to(images.device).expand(len(images), *tokens.shape[1:]) for tokens in self._of_grey)
+        pooled, patches = self._encode(torch.full_like(images[:1].float(), GREY) if self.blind else images)
+        return pooled.expand(len(images), -1), patches.expand(len(images), -1, -1)
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        if self._is_compiled_for(self.device):
-            return self._encode_compiled(images)
-        return self._encode_eagerly(images, self.precision)
-
-    def _encode_compiled(self, images: Tensor) -> tuple[Tensor, Tensor]:
         with computing_in("float32", self.device):  # OpenVINO cannot convert the casts of autocast
-            if self._compiled is None:
-                self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
-            return self._compiled(self.preprocess(images))
-
-    @torch.no_grad()
-    def _encode_eagerly(self, images: Tensor, precision: str) -> tuple[Tensor, Tensor]:
-        with computing_in("float32", self.device):
             pixels = self.preprocess(images)
-        with computing_in(precision, self.device):
+            if self.runtime == "openvino":
+                return self._compile()(pixels)
+        with computing_in(self.precision, self.device):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()
 
-    def drift(self, images: Tensor, precision: str, on_cpu: bool = False) -> float:
-        """How far the patch features of images are from others, in shares of the others' norm.
-
-        PyTorch computes the others, also where it has to emulate their precision.
-
-        Args:
-            precision: that of the others.
-            on_cpu: whether a CPU computes the others, instead of this encoder's own device.
-        """
-        if self.blind:
-            images = torch.full_like(images[:1].float(), GREY)
-        ours = self.encode(images)[1].cpu()
-        other = deepcopy(self).cpu() if on_cpu else self
-        theirs = other._encode_eagerly(images.to(other.device), precision)[1].cpu()
-        return ((ours - theirs).norm() / theirs.norm()).item()
+    def _compile(self) -> openvino.OpenVINOEncoder:
+        """Return the backbone compiled for this CPU, which is done once."""
+        if self._compiled is None:
+            self._compiled = openvino.OpenVINOEncoder(self.model, self.spec.encode, IMAGE_SIZE, self.precision)
+        return self._compiled
 
     def preprocess(self, images: Tensor) -> Tensor:
         """Crop, resize to 224 x 224 where needed and apply the backbone's own pixel statistics."""
@@ -124,15 +124,11 @@ class FrozenEncoder(nn.Module):
                 ..., round(top * height) : round(bottom * height), round(left * width) : round(right * width)
             ]
         if images.shape[-2:] != (IMAGE_SIZE, IMAGE_SIZE):
-            size = (IMAGE_SIZE, IMAGE_SIZE)
-            images = F.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)
+            images = F.interpolate(images, (IMAGE_SIZE, IMAGE_SIZE), mode="bicubic", antialias=True).clamp(0, 1)
         return (images - self.mean) / self.std
 
-    def _is_compiled_for(self, device: torch.device) -> bool:
-        return device.type == "cpu" and openvino.is_installed() and is_native(self.precision, device)
-
     def _forget_compiled(self, *_: Any) -> None:
-        self._compiled = self._of_grey = None
+        self._compiled = None
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_compiled": None}  # for copies and other processes, which compile their own

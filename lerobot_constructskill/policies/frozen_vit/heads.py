@@ -1,54 +1,44 @@
-"""The part that trains: a readout and two linear heads, from tokens to a chunk of actions; and their loss."""
+"""The part that trains: a readout and two heads, from tokens to a chunk of actions; and its loss."""
 
 from itertools import pairwise
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F  # noqa: N812
+from lerobot.utils import OBS_STATE
 from torch import Tensor, nn
 
-from .readouts import POINT_SCALE
+from .configuration_frozen_vit import FrozenViTChunkConfig
+from .readouts import READOUTS
 
-REGRESSION_LOSSES = {"mse": Tensor.square, "l1": Tensor.abs}
-"""What a translation's error costs: the paper's squared error, or the absolute one of ACT (Zhao et al. 2023)."""
+COSTS = {"mse": Tensor.square, "l1": Tensor.abs}
+"""Cost of a translation's error: the paper's squared error, or the absolute one of ACT (Zhao et al. 2023)."""
 
 
 class ChunkHeads(nn.Module):
     """Two heads that share no weights (paper, section II), on one vector: linear, or with hidden layers.
 
     Args:
-        readout: makes that vector of what was pooled of the tokens; it may have parameters of its own.
-        input_dim: length of the vector, with the state where the heads see it.
-        chunk_size: steps T predicted at once.
-        n_regressed: translations (and rotations) R of an action; the gripper makes A = R + 1.
-        action_scale: bound of the regression, in metres (and radians).
-        hidden_dim: width of the hidden layers, None for none.
-        hidden_layers: how many of them.
+        config: says the readout, the state, the shape of a chunk of T steps and A channels, and the layers.
+        feature_dim: length of the encoder's features.
     """
 
-    def __init__(
-        self,
-        readout: nn.Module,
-        input_dim: int,
-        chunk_size: int,
-        n_regressed: int,
-        action_scale: float,
-        hidden_dim: int | None = None,
-        hidden_layers: int = 1,
-    ):
+    def __init__(self, config: FrozenViTChunkConfig, feature_dim: int):
         super().__init__()
-        self.chunk_shape = (chunk_size, n_regressed)
-        self.action_scale = action_scale
-        self.readout = readout
-        hidden = [hidden_dim] * hidden_layers if hidden_dim else []
-        self.translation = _head(input_dim, hidden, chunk_size * n_regressed)
-        self.gripper = _head(input_dim, hidden, chunk_size)
+        spec = READOUTS[config.readout]
+        self.chunk_shape = (config.chunk_size, len(config.action_names) - 1)
+        self.action_scale = config.action_scale
+        self.readout = spec.build(feature_dim)
+        input_dim = spec.dim(feature_dim) + (config.input_features[OBS_STATE].shape[0] if config.use_state else 0)
+        hidden = [config.head_hidden_dim] * config.head_hidden_layers if config.head_hidden_dim else []
+        self.translation = _head(input_dim, hidden, self.chunk_shape[0] * self.chunk_shape[1])
+        self.gripper = _head(input_dim, hidden, self.chunk_shape[0])
 
     def forward(self, pooled: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a chunk and what the readout made, for pooled tokens (B, ...).
 
         Returns:
-            (B, T, A), bounded translations, then the gripper's logit or number; and the readout's vector.
+            (B, T, A), bounded translations in metres (and rotations in radians), then the gripper's logit or number;
+            and the readout's vector.
         """
         read = self.readout(pooled)
         inputs = read if state is None else torch.cat([read, state], dim=-1)
@@ -64,68 +54,47 @@ def _head(input_dim: int, hidden: list[int], output_dim: int) -> nn.Module:
     return nn.Sequential(*layers, nn.Linear(hidden[-1], output_dim))
 
 
-class ChunkErrors(NamedTuple):
-    """What a batch of chunks is off by; zero where a step is padded.
-
-    Args:
-        offset: (B, T, R), in metres (and radians).
-        regression: (B, T), what the loss takes of translations (and rotations).
-        gripper: (B, T), binary cross-entropy or squared error.
-        n_valid: (B,) steps that are not padded.
-        points: (B,), how far along x and y the readout's points are from theirs, where half the image is 1; 0 for a
-            readout that finds none.
-    """
-
-    offset: Tensor
-    regression: Tensor
-    gripper: Tensor
-    n_valid: Tensor
-    points: Tensor
-
-    def regression_loss(self) -> Tensor:
-        return self.regression.sum() / self.n_valid.sum()
-
-    def gripper_loss(self) -> Tensor:
-        return self.gripper.sum() / self.n_valid.sum()
-
-    def loss(self, regression_weight: float, point_weight: float) -> Tensor:
-        """The mean over all valid steps, and of points over all samples."""
-        chunks = regression_weight * self.regression_loss() + self.gripper_loss()
-        return chunks + point_weight * self.points.mean()
-
-    def loss_per_sample(self, regression_weight: float, point_weight: float) -> Tensor:
-        """The mean over each sample's valid steps, and that of its points, (B,)."""
-        errors = regression_weight * self.regression + self.gripper
-        return errors.sum(dim=1) / self.n_valid.clamp(min=1) + point_weight * self.points
+def offsets(chunk: Tensor, target: Tensor, padded: Tensor) -> Tensor:
+    """Return how far translations (and rotations) are off, (B, T, A - 1), 0 where a step is padded (B, T)."""
+    return (chunk[..., :-1] - target[..., :-1]).masked_fill(padded[..., None], 0.0)
 
 
-def chunk_errors(
-    raw: Tensor,
+def heads_loss(
+    config: FrozenViTChunkConfig,
+    chunk: Tensor,
     read: Tensor,
     target: Tensor,
     padded: Tensor,
-    points: Tensor | None = None,
-    *,
-    gripper_head: str,
-    regression_loss: str = "mse",
-) -> ChunkErrors:
-    """Compare what the heads returned with actions.
+    told: Tensor | None = None,
+    reduction: str = "mean",
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Compare what `ChunkHeads` returned with actions, and what its readout made with what that is told.
 
     Args:
-        raw: (B, T, A), from `ChunkHeads`.
+        config: says the losses and their weights.
+        chunk: (B, T, A), from `ChunkHeads`.
         read: (B, ...), what its readout made.
         target: (B, T, A), the gripper +1 or -1.
         padded: (B, T), true for steps beyond an episode's end.
-        points: (B, 2P), x and y of the readout's points, from -1 to 1; None where it finds none or none is told.
-        gripper_head: "bce" or "regression".
-        regression_loss: one of `REGRESSION_LOSSES`.
+        told: (B, ...), what a readout that has a loss of its own learns from.
+        reduction: "mean" over all valid steps (of the readout's loss over samples), or "none" for each sample (B,).
+
+    Returns:
+        The loss, and its terms before they are weighted.
     """
-    offset = (raw[..., :-1] - target[..., :-1]).masked_fill(padded[..., None], 0.0)
-    regression = REGRESSION_LOSSES[regression_loss](offset).mean(dim=-1)
-    if gripper_head == "regression":
-        gripper = (raw[..., -1] - target[..., -1]).pow(2)
+    regression = COSTS[config.regression_loss](offsets(chunk, target, padded)).mean(dim=-1)
+    if config.gripper_head == "regression":
+        gripper = (chunk[..., -1] - target[..., -1]).pow(2)
     else:
-        gripper = F.binary_cross_entropy_with_logits(raw[..., -1], (target[..., -1] + 1) / 2, reduction="none")
+        gripper = F.binary_cross_entropy_with_logits(chunk[..., -1], (target[..., -1] + 1) / 2, reduction="none")
+    gripper = gripper.masked_fill(padded, 0.0)
     n_valid = (~padded).sum(dim=1)
-    astray = torch.zeros_like(read[..., 0]) if points is None else (read / POINT_SCALE - points).abs().mean(dim=-1)
-    return ChunkErrors(offset, regression, gripper.masked_fill(padded, 0.0), n_valid, astray)
+    terms = {"regression_loss": regression.sum() / n_valid.sum(), "gripper_loss": gripper.sum() / n_valid.sum()}
+    if reduction == "none":
+        loss = (config.regression_weight * regression + gripper).sum(dim=1) / n_valid.clamp(min=1)
+    else:
+        loss = config.regression_weight * terms["regression_loss"] + terms["gripper_loss"]
+    if told is not None:
+        terms["point_loss"] = READOUTS[config.readout].loss(read, told, reduction)
+        loss = loss + config.point_weight * terms["point_loss"]
+    return loss, terms

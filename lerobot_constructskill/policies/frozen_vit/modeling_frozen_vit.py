@@ -1,36 +1,43 @@
 """The reference policy of the paper: a frozen encoder, two linear heads, overlapping chunks."""
 
+import json
 import logging
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import HFValidationError
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
 from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
-from .encoder import FrozenEncoder
-from .ensembling import ensemble
-from .features import check_features, computed_by, describe, made_in, open_patches
-from .heads import ChunkErrors, ChunkHeads, chunk_errors
-from .precision import check_native, resolve_precision
+from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
+from .feature_sets import check_features, describe, open_patches, stated
+from .heads import ChunkHeads, heads_loss, offsets
+from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
 from .readouts import READOUTS
-from .shared_eyes import POOLED, SharedEyes
-from .weights import OtherWeightsError, load_weights, read_tensors, state_sha256
+from .shared_encoder import POOLED, SharedEncoders
+from .weights import load_weights, read_tensors, state_sha256
 
 HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
+DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "gripper_head", "action_scale")
+"""Fields that give other numbers of the same shape to the heads, or read other actions out of theirs."""
+
 SILENT = 1e-3
 """A feature whose standard deviation is below this share of the median one is not divided by it."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -38,10 +45,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     """Predicts a chunk of translations and gripper states from one camera image.
 
     Args:
-        config: the configuration; the source and hash of the backbone's weights are written into it.
+        config: the configuration; the precision that `auto` stands for is written into it.
         dataset_stats: the data set's statistics as LeRobot keeps them; a feature set's serve `standardize_features`.
         dataset_meta: the data set's `LeRobotDatasetMetadata`; a feature set's patch features lie in its folder.
-        load_backbone: False leaves the backbone without weights; `from_pretrained` fills it.
+        encoder_record: what a checkpoint says of its encoder. With it the backbone stays without weights, which
+            `from_pretrained` fills in.
 
     Raises:
         FileNotFoundError: the backbone's weights cannot be had, or the readout's patch features are not there.
@@ -51,8 +59,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     config_class = FrozenViTChunkConfig
     name = "frozen_vit"
-    in_lockstep = SharedEyes
-    """What rollouts of many policies look with, `rollout.agents.Lockstep`."""
+    in_lockstep = SharedEncoders
+    """Encodes for many policies at once in a rollout, as `rollout.agents.Lockstep` says."""
 
     def __init__(
         self,
@@ -60,53 +68,39 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         *,
         dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: Any = None,
-        load_backbone: bool = True,
+        encoder_record: EncoderRecord | None = None,
         **kwargs: Any,
     ):
         super().__init__(config)
         config.validate_features()
-        if dataset_meta is not None:
-            config.check_rate(dataset_meta.fps)
         self.config = config
-        self._settle_precision()
-        spec = get_backbone(config.backbone, config.backbone_path)
-        self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
-        self._check_column(config.backbone_sha256 or _encoders_sha256(config.feature_column))
-        if load_backbone:
-            check_native(config.backbone_precision, config.device)
-            self._load_backbone()
-        self._check_column(config.backbone_sha256)
         self.readout = READOUTS[config.readout]
         if dataset_meta is not None:
-            self._check_points(dataset_meta.features)
+            self._check_data_set(dataset_meta)
+        self.encoder_record = self._begin_record(encoder_record)
+        spec = get_backbone(config.backbone, config.backbone_path)
+        self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
+        self._check_column()
+        if encoder_record is None:
+            check_native(config.backbone_precision, config.device)
+            self._load_backbone()
         self._find_patches(dataset_meta.root if dataset_meta is not None else None)
         self.heads = self.fresh_heads()
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
         self.register_buffer("feature_std", torch.ones(spec.feature_dim))
-        if load_backbone and config.standardize_features:
+        if encoder_record is None and config.standardize_features:
             self._take_statistics(dataset_stats or {})
 
         self.register_state_dict_post_hook(_drop_backbone)
         self.register_load_state_dict_post_hook(_excuse_backbone)
-        self._heldout = [0.0, 0]
-        self._heldout_report: dict[str, float] = {}
+        self._heldout = (0.0, 0)
         self._has_seen = False
         self.reset()
 
     def fresh_heads(self) -> ChunkHeads:
         """Return heads with newly drawn weights."""
-        config, dim = self.config, self.backbone.spec.feature_dim
-        state_dim = config.input_features[OBS_STATE].shape[0] if config.use_state else 0
-        return ChunkHeads(
-            self.readout.build(dim),
-            self.readout.dim(dim) + state_dim,
-            config.chunk_size,
-            len(config.action_names) - 1,
-            config.action_scale,
-            config.head_hidden_dim,
-            config.head_hidden_layers,
-        )
+        return ChunkHeads(self.config, self.backbone.spec.feature_dim)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -116,43 +110,37 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._action_queue: deque[Tensor] = deque(maxlen=self.config.chunk_size)
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Return the loss on a batch of chunks.
+        """Return the loss on a batch of chunks, and its terms as floats.
+
+        In evaluation mode the translation error is also added up: LeRobot keeps nothing but the loss on held-out data.
 
         Args:
             batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
                 that finds points also where they are, (B, 2P).
             reduction: "mean" over all valid steps (of points over samples), or "none" for one loss per sample (B,).
 
-        Returns:
-            The loss, and its terms as floats. In evaluation mode the translation error is also accumulated, and
-            calls in training mode report its mean over all valid steps of the last evaluation as
-            `heldout_translation_mse_m2`: LeRobot throws away what `forward` returns on held-out data, and shows 0
-            for what is reported only once.
+        Raises:
+            ValueError: the batch lacks the points.
         """
-        errors = self._chunk_errors(batch)
-        logs = {"regression_loss": errors.regression_loss().item(), "gripper_loss": errors.gripper_loss().item()}
-        if self.training:
-            logs |= self._heldout_report
-        else:
-            self._heldout = [a + b for a, b in zip(self._heldout, self._translation_error(errors), strict=True)]
-        if self.readout.points:
-            if self.config.point_key not in batch:
-                raise self._untold()
-            logs["point_loss"] = errors.points.mean().item()
-        loss = errors.loss_per_sample if reduction == "none" else errors.loss
-        return loss(self.config.regression_weight, self.config.point_weight), logs
+        points = batch.get(self.config.point_key) if self.readout.points else None
+        if self.readout.points and points is None:
+            raise self._lacks_points()
+        chunk, read = self.heads(*self.head_inputs(batch))
+        if not self.training:
+            error, count = self._translation_error(chunk, batch)
+            self._heldout = (self._heldout[0] + error, self._heldout[1] + count)
+        loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], _padded(batch), points, reduction)
+        return loss, {name: term.mean().item() for name, term in terms.items()}
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
-        """Switch the heads' mode; back in training mode, close the held-out pass that came before."""
-        if mode and self.config.feature_column is None:  # images: what the heads learn from is our own
-            self.config.backbone_trained_precision = self.backbone.precision
-            self.config.backbone_trained_runtime = self.backbone.runtime
-        total, count = self._heldout
+        """Switch the heads' mode; back in training mode, log the error of the held-out pass that came before."""
+        if mode and self.config.feature_column is None:  # the heads learn from this encoder's own features
+            own = {"precision": self.backbone.precision, "runtime": self.backbone.runtime}
+            self.encoder_record = replace(self.encoder_record, **own)
+        error, count = self._heldout
         if mode and count:
-            self._heldout = [0.0, 0]
-            self._heldout_report = {HELDOUT_METRIC: total / count}
-            # LeRobot's meters print three decimals, and no step follows the last evaluation.
-            logger.info("%s=%.4e", HELDOUT_METRIC, total / count)
+            self._heldout = (0.0, 0)
+            logger.info("%s=%.4e", HELDOUT_METRIC, error / count)  # LeRobot's meters print three decimals
         return super().train(mode)
 
     @torch.no_grad()
@@ -177,18 +165,26 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """Load a checkpoint; one that holds its backbone needs no other source of weights.
 
         What an `hf/...` backbone is, and which pixels it takes, is still read from `backbone_path` or the Hub.
+
+        Raises:
+            FileNotFoundError: the checkpoint has no weights, or no `encoder.json`.
+            ValueError: a file of it is damaged, or the configuration is not the one that it was trained with.
         """
-        return super().from_pretrained(pretrained_name_or_path, load_backbone=False, **kwargs)
+        record = _read_record(pretrained_name_or_path, kwargs)
+        return super().from_pretrained(pretrained_name_or_path, encoder_record=record, **kwargs)
+
+    def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
+        super()._save_pretrained(save_directory, **kwargs)
+        text = json.dumps(asdict(self.encoder_record), indent=4) + "\n"
+        (Path(save_directory) / RECORD_FILE).write_text(text, encoding="utf-8")
 
     @classmethod
     def _load_as_safetensor(
         cls, model: "FrozenViTChunkPolicy", model_file: str, map_location: str, strict: bool
     ) -> "FrozenViTChunkPolicy":
         state = read_tensors(Path(model_file))
-        holds_backbone = any(name.startswith(BACKBONE_PREFIX) for name in state)
-        if not holds_backbone:
+        if not any(name.startswith(BACKBONE_PREFIX) for name in state):
             model._load_backbone()
-            state |= {BACKBONE_PREFIX + name: t for name, t in model.backbone.state_dict().items()}
         try:
             model.load_state_dict(state, strict=True)
         except RuntimeError as error:
@@ -198,71 +194,74 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
                 "config.json it was saved with, or train again."
             ) from None
         model._check_inputs(Path(model_file).with_name("config.json"))
-        if holds_backbone:
-            model._check_backbone(model_file)
-        model._check_statistics(model_file)
+        found, recorded = state_sha256(model.backbone.model.state_dict()), model.encoder_record.sha256
+        if found != recorded:
+            raise InputError(
+                f"The backbone in '{model_file}' has sha256 {found[:12]}, but {RECORD_FILE} records "
+                f"{str(recorded)[:12]}: one of the two files was changed; copy or download the checkpoint again."
+            )
         return model
 
-    def wrap_with_peft(self, *args: Any, **kwargs: Any) -> None:
-        raise NotImplementedError(
-            "frozen_vit trains two linear layers on a frozen backbone; PEFT has nothing to adapt."
-        )
+    def _begin_record(self, recorded: EncoderRecord | None) -> EncoderRecord:
+        """Return what is known of the encoder before its weights are there, and settle its precision.
 
-    def _settle_precision(self) -> None:
-        config = self.config
-        trained = made_in(config.feature_column) or config.backbone_trained_precision
+        A data set's features say what they are. Otherwise the checkpoint, or without one the configuration, does.
+        """
+        config, column = self.config, self.config.feature_column
+        asked = config.backbone_sha256 or stated(column, "weights_sha256")
+        known = recorded or EncoderRecord(sha256=asked, precision=config.backbone_trained_precision)
+        trained = stated(column, "precision", PRECISIONS) or known.precision
         config.backbone_precision = resolve_precision(config.backbone_precision, config.device, trained)
-        config.backbone_trained_precision = trained or config.backbone_precision
-        config.backbone_trained_runtime = computed_by(config.feature_column) or config.backbone_trained_runtime
+        runtime = stated(column, "runtime", RUNTIMES) or known.runtime
+        return replace(known, precision=trained or config.backbone_precision, runtime=runtime)
 
-    def _check_column(self, sha256: str | None) -> None:
-        """Refuse features of another encoder than this one with weights of that hash."""
-        config, spec = self.config, self.backbone.spec
-        if config.feature_column is not None:
-            made_by = describe(spec, sha256, config.backbone_trained_precision, config.crop, config.blind)
-            check_features(config.feature_column, made_by, spec.feature_dim)
+    def _check_column(self) -> None:
+        """Refuse features that were made by another encoder."""
+        record, encoder, column = self.encoder_record, self.backbone, self.config.feature_column
+        if column is not None:
+            made_by = describe(encoder.spec, record.sha256, record.precision, encoder.crop, encoder.blind)
+            check_features(column, made_by, encoder.spec.feature_dim)
 
-    def _check_points(self, features: Mapping[str, Mapping]) -> None:
-        """Refuse a data set that does not say where the points are that the readout learns to find."""
-        found = features.get(self.config.point_key, {}).get("names")
+    def _check_data_set(self, meta: Any) -> None:
+        """Refuse a data set of another rate, or without the points that the readout learns to find."""
+        if meta.fps != self.config.fps:
+            raise InputError(
+                f"The data set has {meta.fps} frames a second and the policy acts at {self.config.fps} Hz: train on a "
+                "set of that rate, or set fps if what it is for runs at another."
+            )
+        found = meta.features.get(self.config.point_key, {}).get("names")
         if self.readout.points and found != [*self.readout.points]:
-            raise self._untold()
+            raise self._lacks_points()
 
-    def _untold(self) -> InputError:
+    def _lacks_points(self) -> InputError:
         return InputError(
             f"readout={self.config.readout} learns from {self.config.point_key} ({', '.join(self.readout.points)}): "
             "train on a feature set that constructskill-encode makes with --patches=true --points=true."
         )
 
     def _find_patches(self, root: Path | None) -> None:
-        """Know where a data set's patch features lie, and that they are there if they are to be read."""
+        """Keep the folder of a data set's patch features, and refuse one without them if they are to be read."""
         self.patches_root = root
         if self.config.feature_column is not None and self.readout.reads_patches:
             open_patches(root)
 
-    def _log_crossing(self, image: Tensor) -> None:
-        """Log that features are computed otherwise than those that the heads learned from, and how far they differ."""
-        precision, trained = self.config.backbone_precision, self.config.backbone_trained_precision
-        on_cpu = self.config.backbone_trained_runtime == "openvino" and self.backbone.device.type != "cpu"
-        if precision != trained or on_cpu:
-            learned, acts = ("of a CPU ", f"of {self.backbone.device} ") if on_cpu else ("", "")
-            crossing = f"frozen_vit, trained on features {learned}in {trained}, acts on features {acts}in {precision}"
-            share = 100 * self.backbone.drift(image, trained, on_cpu)
-            logger.warning("%s; on its first image they differ by %.2g %% of their norm.", crossing, share)
+    def _log_crossing(self) -> None:
+        """Log that features are computed otherwise than those that the heads learned from."""
+        record, encoder = self.encoder_record, self.backbone
+        left_cpu = record.runtime == "openvino" and encoder.device.type != "cpu"
+        if encoder.precision != record.precision or left_cpu:
+            logger.warning(
+                "frozen_vit, trained on features of %s in %s, acts on features of %s in %s: they differ a little.",
+                *(record.runtime, record.precision, encoder.runtime, encoder.precision),
+            )
 
     def _load_backbone(self) -> None:
-        config = self.config
-        wanted = config.backbone_sha256 or _encoders_sha256(config.feature_column)
-        try:
-            pretrained = config.backbone_pretrained
-            state, source = load_weights(self.backbone.spec, config.backbone_path, wanted, pretrained)
-        except OtherWeightsError:
-            if config.backbone_sha256 is not None:
-                raise
-            # Any weights, for `check_features` to say all that differs from the data set's encoder.
-            state, source = load_weights(self.backbone.spec, config.backbone_path, pretrained=pretrained)
+        config, record = self.config, self.encoder_record
+        state, source = load_weights(
+            self.backbone.spec, config.backbone_path, record.sha256, config.backbone_pretrained
+        )
         self.backbone.model.load_state_dict(state)
-        config.backbone_source, config.backbone_sha256 = source, state_sha256(state)
+        self.encoder_record = replace(record, source=source, sha256=record.sha256 or state_sha256(state))
 
     def _take_statistics(self, dataset_stats: dict[str, dict[str, Any]]) -> None:
         stats = dataset_stats.get(self.config.feature_key)
@@ -277,34 +276,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.feature_std.copy_(torch.where(std > SILENT * std.median().clamp(min=1e-3), std, 1))
 
     def _check_inputs(self, path: Path) -> None:
-        """Refuse what would make other numbers of the same shape of the heads' input or output than in training."""
+        """Refuse a configuration under which the heads' input or output means something else than in training."""
         saved = SAVED.read(path) if path.is_file() else {}
-        for name in ("backbone", "readout", "crop", "blind", "gripper_head", "action_scale"):
+        trained = {name: saved[name] for name in DECISIVE if name in saved}
+        trained["backbone_sha256"] = self.config.backbone_sha256 and self.encoder_record.sha256
+        for name, value in trained.items():
             asked = getattr(self.config, name)
             asked = list(asked) if isinstance(asked, tuple) else asked
-            if asked != (trained := saved.get(name, asked)):
-                raise InputError(
-                    f"The checkpoint was trained with {name}={trained}, so it cannot have {name}={asked}."
-                )
-
-    def _check_backbone(self, model_file: str) -> None:
-        found, recorded = state_sha256(self.backbone.model.state_dict()), self.config.backbone_sha256
-        if recorded is None:
-            self.config.backbone_sha256 = found
-        elif found != recorded:
-            raise InputError(
-                f"The backbone in '{model_file}' has sha256 {found[:12]}, but config.json records "
-                f"{recorded[:12]}: one of the two files was changed; copy or download the checkpoint again."
-            )
-
-    def _check_statistics(self, model_file: str) -> None:
-        asked = self.config.standardize_features
-        trained = bool(self.feature_mean.any() or (self.feature_std != 1).any())
-        if asked != trained:
-            raise InputError(
-                f"'{model_file}' was trained with standardize_features={str(trained).lower()}, but the configuration "
-                f"says {str(asked).lower()}: keep the checkpoint's choice or train from scratch."
-            )
+            if asked != value:
+                raise InputError(f"The checkpoint was trained with {name}={value}, so it cannot have {name}={asked}.")
 
     def read_features(self, meta: Any) -> None:
         """Read a data set's features from now on, if it has those of the policy's camera in place of its images.
@@ -317,7 +297,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             FileNotFoundError: it lacks the patch features that the readout takes.
         """
         self.config.set_dataset_feature_metadata(meta.features)
-        self._check_column(self.config.backbone_sha256)
+        self._check_column()
         self._find_patches(meta.root)
 
     def pool(self, images: Tensor) -> Tensor:
@@ -328,7 +308,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """
         if not self._has_seen:
             check_native(self.config.backbone_precision, self.config.device)
-            self._log_crossing(images[:1])
+            self._log_crossing()
             self._has_seen = True
         return self.readout.pool(*self.backbone.encode(images))
 
@@ -346,25 +326,26 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def translation_error(self, batch: dict[str, Tensor]) -> tuple[float, int]:
         """Return the sum of a batch's squared translation errors over valid steps, in m2, and of how many numbers."""
-        return self._translation_error(self._chunk_errors(batch))
+        return self._translation_error(self._raw_chunk(batch), batch)
 
-    def _chunk_errors(self, batch: dict[str, Tensor]) -> ChunkErrors:
-        padded = batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
-        points = batch.get(self.config.point_key) if self.readout.points else None
-        return chunk_errors(*self._heads_on(batch), batch[ACTION], padded, points, **self.config.losses)
+    def _translation_error(self, chunk: Tensor, batch: dict[str, Tensor]) -> tuple[float, int]:
+        padded = _padded(batch)
+        metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
+        squares = offsets(chunk, batch[ACTION], padded)[..., metres].square()
+        return squares.sum().item(), int((~padded).sum()) * len(metres)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        return self._heads_on(batch)[0]
-
-    def _heads_on(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        return self.heads(*self.head_inputs(batch))
+        return self.heads(*self.head_inputs(batch))[0]
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
         if POOLED in batch:
             return batch[POOLED]
         if self.config.feature_key in batch:
             cls = batch[self.config.feature_key].float()
-            return self.readout.pool(cls, self._patches(batch).to(cls)) if self.readout.reads_patches else cls
+            if not self.readout.reads_patches:
+                return cls
+            patches = open_patches(self.patches_root)[batch["index"].cpu()]  # (B, N, D) float16
+            return self.readout.pool(cls, patches.to(cls))
         if self.config.image_key in batch:
             return self.pool(batch[self.config.image_key])
         raise InputError(
@@ -372,24 +353,55 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             f"{', '.join(batch)}. obs_type=pixels_agent_pos shows the wrist camera and the state as well."
         )
 
-    def _patches(self, batch: dict[str, Tensor]) -> Tensor:
-        """Patch features (B, N, D) float16 of a feature set's frames, by their `index`."""
-        return open_patches(self.patches_root)[batch["index"].cpu()]
-
     def _to_action(self, raw: Tensor) -> Tensor:
         boundary = 0.0 if self.config.gripper_head == "regression" else self.config.gripper_threshold
         gripper = torch.where(raw[..., -1:] > boundary, 1.0, -1.0)
         return torch.cat([raw[..., :-1], gripper], dim=-1)
 
-    def _translation_error(self, errors: ChunkErrors) -> tuple[float, int]:
-        """The sum of squares over all valid steps, in m2, and how many numbers it is of."""
-        metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        return errors.offset[..., metres].square().sum().item(), int(errors.n_valid.sum()) * len(metres)
+
+def ensemble(chunks: Sequence[Tensor], coeff: float) -> Tensor:
+    """Average what each chunk says about the current step.
+
+    The weights are LeRobot's (`ACTTemporalEnsembler`): exp(-coeff * i) with i = 0 for the oldest chunk, so a
+    negative coefficient weighs the newest chunk most. With coeff = -0.1 the weights are, up to their sum, the
+    paper's exp(-0.1 k), k being the steps since a chunk was predicted.
+
+    Args:
+        chunks: the last chunks, one per step, newest last, each (B, T, A); at most T of them, so that each
+            still covers the current step.
+        coeff: decay per step.
+
+    Returns:
+        (B, A)
+    """
+    newest = len(chunks) - 1
+    current = torch.stack([chunk[:, newest - i] for i, chunk in enumerate(chunks)])
+    weights = torch.exp(-coeff * torch.arange(len(chunks), device=current.device, dtype=current.dtype))
+    return torch.einsum("n,nba->ba", weights / weights.sum(), current)
 
 
-def _encoders_sha256(column: Mapping[str, Any] | None) -> str | None:
-    """Hash of the weights that made a feature column, so that an outage of the Hub cannot change the source."""
-    return ((column or {}).get("info") or {}).get("weights_sha256")
+def _read_record(checkpoint: str | Path, options: Mapping[str, Any]) -> EncoderRecord:
+    """Read the `encoder.json` of a checkpoint, a folder or a name on the Hub.
+
+    Args:
+        options: those of `from_pretrained`.
+    """
+    names = ("revision", "cache_dir", "force_download", "token", "local_files_only")
+    asked = {name: options[name] for name in names if name in options}
+    folder = Path(checkpoint)
+    try:
+        file = folder / RECORD_FILE if folder.is_dir() else hf_hub_download(str(checkpoint), RECORD_FILE, **asked)
+        return RECORD.read(Path(file))
+    except (OSError, HFValidationError) as error:
+        raise MissingError(
+            f"The checkpoint '{checkpoint}' has no {RECORD_FILE}, which says what its encoder is "
+            f"({first_line(error).rstrip('.')}): copy or push it again with all of its files."
+        ) from error
+
+
+def _padded(batch: Mapping[str, Tensor]) -> Tensor:
+    """Return which steps (B, T) lie beyond an episode's end; none where the batch does not say."""
+    return batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
 
 
 def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metadata: dict) -> None:
@@ -399,6 +411,5 @@ def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metad
 
 
 def _excuse_backbone(policy: FrozenViTChunkPolicy, incompatible: Any) -> None:
-    if not policy.config.save_backbone:
-        missing = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]
-        incompatible.missing_keys[:] = missing
+    """Let state dicts be without the backbone, whose hash tells whether it is whole."""
+    incompatible.missing_keys[:] = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]

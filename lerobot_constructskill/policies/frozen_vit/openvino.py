@@ -3,16 +3,16 @@
 import importlib.util
 import sys
 import warnings
-from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-HINTS = {"float32": "f32", "bfloat16": "bf16"}
+from .weights import Encode
 
-Encode = Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
+HINTS = {"float32": "f32", "bfloat16": "bf16"}
 
 
 def is_installed() -> bool:
@@ -20,7 +20,7 @@ def is_installed() -> bool:
 
 
 def import_openvino() -> ModuleType:
-    """OpenVINO, but not the package that pip installs with it and that reports every conversion over the network."""
+    """Import OpenVINO without the package that pip installs beside it, which reports conversions over the network."""
     sys.modules.setdefault("openvino_telemetry", None)  # an import of it now fails, which OpenVINO takes for absent
     import openvino
 
@@ -54,23 +54,23 @@ class OpenVINOEncoder:
             "PERFORMANCE_HINT": "THROUGHPUT",
         }
         self._requests = openvino.AsyncInferQueue(openvino.Core().compile_model(graph, "CPU", settings))
-        self._outputs: list[np.ndarray] = []
-        self._requests.set_callback(self._keep)
 
     def __call__(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Return the pooled features (B, D) and the patch features (B, N, D), float32, of pixels (B, 3, H, W)."""
         images = pixels.numpy()
         shapes = [tuple(output.shape)[1:] for output in self._requests[0].model_outputs]
-        self._outputs = [np.empty((len(images), *shape), dtype=np.float32) for shape in shapes]
+        outputs = [np.empty((len(images), *shape), dtype=np.float32) for shape in shapes]
+
+        def keep(request: Any, i: int) -> None:
+            for number, output in enumerate(outputs):
+                output[i] = request.get_output_tensor(number).data[0]
+
+        self._requests.set_callback(keep)
         for i in range(len(images)):
             self._requests.start_async([images[i : i + 1]], i)
         self._requests.wait_all()
-        pooled, patches = map(torch.from_numpy, self._outputs)
+        pooled, patches = map(torch.from_numpy, outputs)
         return pooled, patches
-
-    def _keep(self, request, i: int) -> None:
-        for number, output in enumerate(self._outputs):
-            output[i] = request.get_output_tensor(number).data[0]
 
 
 class Traceable(nn.Module):

@@ -11,10 +11,10 @@ from lerobot_constructskill.errors import InputError, MachineError
 PRECISIONS = ("float32", "bfloat16")
 
 RUNTIMES = ("openvino", "torch")
-"""What may compute a backbone's features: OpenVINO on a CPU, or PyTorch."""
+"""Libraries that may compute a backbone's features: OpenVINO on a CPU, or PyTorch."""
 
 AUTO = "auto"
-"""That of the feature set or checkpoint, where there is one, or else the fastest that the device does natively."""
+"""The precision of the feature set or checkpoint. Without either, the fastest that the device does natively."""
 
 ISA_CAP = "ONEDNN_MAX_CPU_ISA"
 """Environment variable that keeps the kernels of PyTorch and OpenVINO from newer instructions than a CPU may have."""
@@ -37,24 +37,19 @@ def native_precision(device: torch.device | str = "cpu") -> str:
     return "bfloat16" if native else "float32"
 
 
-def check_precision(asked: str) -> None:
-    """Refuse what is neither `auto` nor a precision.
+def resolve_precision(asked: str, device: torch.device | str, made_in: str | None = None) -> str:
+    """Return what `auto` means on a device, or for features that were `made_in` one precision already.
 
     Raises:
-        ValueError: the message lists what there is.
+        ValueError: `asked` is neither `auto` nor a precision, and the message lists what there is.
     """
     if asked not in (AUTO, *PRECISIONS):
         raise InputError(f"backbone_precision must be one of {', '.join((AUTO, *PRECISIONS))}, got '{asked}'.")
-
-
-def resolve_precision(asked: str, device: torch.device | str, made_in: str | None = None) -> str:
-    """Return what `auto` means on a device, or for what was `made_in` one precision already; others as they are."""
-    check_precision(asked)
     return (made_in or native_precision(device)) if asked == AUTO else asked
 
 
 class NotNativeError(MachineError, ValueError):
-    """A device would have to emulate a precision. Another machine need not, so it is no result of a run."""
+    """A device would have to emulate a precision. Another machine may not, so this is no result of a run."""
 
 
 def check_native(precision: str, device: torch.device | str) -> None:

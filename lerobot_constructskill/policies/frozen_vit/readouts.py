@@ -1,4 +1,4 @@
-"""From an encoder's tokens to the one vector that the linear heads see: one entry of `READOUTS` each."""
+"""From an encoder's tokens to the one vector that the heads see: the entries of `READOUTS`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ QUERIES = 4
 """Learned queries of `attention`."""
 
 POINTS = ("object", "receptacle", "hand")
-"""What `heat_maps` finds, in this order."""
+"""Points in the image that `heat_maps` finds, in this order."""
 
 POINT_NAMES = [f"{point}.{axis}" for point in POINTS for axis in "xy"]
-"""The numbers that say where they are: x to the right, y down."""
+"""Names of the points' positions: x to the right, y down."""
 
 POINT_SCALE = 8.0
-"""Of its positions: where the whole image is from -1 to 1, the millimetres that count are lost on the heads."""
+"""Factor on the positions that `heat_maps` returns: from -1 to 1 the millimetres that count are lost on the heads."""
 
 
-def _keep(dim: int) -> nn.Module:
-    """What is pooled is the vector."""
+def _identity(dim: int) -> nn.Module:
+    """Leave the pooled tokens as they are."""
     return nn.Identity()
 
 
@@ -33,23 +33,34 @@ class Readout:
 
     Args:
         pool: `(cls (B, D), patches (B, N, D)) -> (B, ...)`: what is taken of the tokens, without parameters.
-        build: `D -> module` that trains with the heads and makes one vector of what `pool` took.
-        dim: `D -> length` of that vector.
+        dim: `D -> length` of the vector.
+        build: `D -> module` that trains with the heads and makes the vector of what `pool` took.
         reads_patches: whether `pool` looks at the patches at all.
-        points: names of the numbers that say where in the image things are. It is told them in training, from -1 to 1,
-            and what `build` makes are these numbers times `POINT_SCALE`.
+        points: names of the positions in the image that the vector holds, times `POINT_SCALE`. In training it learns
+            them from the data set's.
     """
 
     pool: Callable[[Tensor, Tensor], Tensor]
     dim: Callable[[int], int]
-    build: Callable[[int], nn.Module] = _keep
+    build: Callable[[int], nn.Module] = _identity
     reads_patches: bool = True
     points: Sequence[str] = ()
 
     @property
     def learns(self) -> bool:
         """Whether the module has parameters, so that what it returns changes in training."""
-        return self.build is not _keep
+        return self.build is not _identity
+
+    def loss(self, read: Tensor, points: Tensor, reduction: str = "mean") -> Tensor:
+        """Return how far, along x and y, the points are from where they were found. Half the image is 1.
+
+        Args:
+            read: (B, 2P), the vector.
+            points: (B, 2P), the data set's positions, from -1 to 1.
+            reduction: "mean" over samples, or "none" for each sample (B,).
+        """
+        distances = (read / POINT_SCALE - points).abs().mean(dim=-1)
+        return distances if reduction == "none" else distances.mean()
 
 
 class SpatialSoftmax(nn.Module):
@@ -68,15 +79,13 @@ class SpatialSoftmax(nn.Module):
 
     def forward(self, patches: Tensor) -> Tensor:
         """Return (B, 2K) for patches (B, N, D) of a square grid: x then y of each keypoint, from -1 to 1."""
-        attention = self.patterns(patches).softmax(dim=-2)
-        positions = attention.transpose(-1, -2) @ _grid(patches.shape[-2]).to(patches)
-        return positions.flatten(-2)
+        return _expected_positions(self.patterns(patches))
 
 
 class HeatMaps(nn.Module):
     """Where in the image some things are: the expected position under a heat map of each.
 
-    A hidden layer draws the maps, one patch at a time; `SpatialSoftmax` has none. In training they are told where the
+    A hidden layer draws the maps, one patch at a time; `SpatialSoftmax` has none. In training the maps learn where the
     things are, as the first layers of Levine et al. 2016 (End-to-End Training of Deep Visuomotor Policies) and the
     auxiliary losses of Zhang et al. 2018 (Deep Imitation Learning for Complex Manipulation Tasks).
 
@@ -92,9 +101,7 @@ class HeatMaps(nn.Module):
 
     def forward(self, patches: Tensor) -> Tensor:
         """Return (B, 2P) for patches (B, N, D) of a square grid: x then y of each point, times `POINT_SCALE`."""
-        maps = self.maps(patches).softmax(dim=-2)
-        positions = maps.transpose(-1, -2) @ _grid(patches.shape[-2]).to(patches)
-        return POINT_SCALE * positions.flatten(-2)
+        return POINT_SCALE * _expected_positions(self.maps(patches))
 
 
 class AttentionPooling(nn.Module):
@@ -115,12 +122,17 @@ class AttentionPooling(nn.Module):
         return (attention.transpose(-1, -2) @ patches).flatten(-2)
 
 
-def _grid(n_patches: int) -> Tensor:
-    """Centres (N, 2) of a square grid's patches in row-major order: x to the right and y down, from -1 to 1."""
-    side = round(n_patches**0.5)
+def _expected_positions(scores: Tensor) -> Tensor:
+    """Return x then y of each map's expected position under a softmax over its patches, (B, 2K), from -1 to 1.
+
+    Args:
+        scores: (B, N, K) of a square grid's N patches in row-major order, x to the right and y down.
+    """
+    side = round(scores.shape[-2] ** 0.5)
     line = (torch.arange(side) + 0.5) / side * 2 - 1
     y, x = torch.meshgrid(line, line, indexing="ij")
-    return torch.stack([x, y], dim=-1).reshape(-1, 2)
+    centres = torch.stack([x, y], dim=-1).reshape(-1, 2).to(scores)
+    return (scores.softmax(dim=-2).transpose(-1, -2) @ centres).flatten(-2)
 
 
 READOUTS = {

@@ -5,9 +5,9 @@ seed and no seed sees another, so a seed trained among others is the seed traine
 trains: sums over several depend on their number, and so would the weights on how many cores a machine has.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from copy import copy, deepcopy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import deepcopy
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -21,8 +21,8 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 
 from .configuration_frozen_vit import FrozenViTChunkConfig
-from .features import open_patches
-from .heads import ChunkHeads, chunk_errors
+from .feature_sets import open_patches
+from .heads import ChunkHeads, heads_loss
 from .modeling_frozen_vit import FrozenViTChunkPolicy
 
 
@@ -59,32 +59,15 @@ def train_seeds(
     inputs = _head_inputs(template, table)
     rows = torch.nonzero(~_is_among(dataset, held_out)).squeeze(1)
     heads = [_fresh_heads(template, seed) for seed in seeds]
-    orders = [_Order(rows, seed, epochs, batch_size) for seed in seeds]
-    with one_thread():
-        _step_together(heads, template.config, inputs, table, orders)
+    n_steps = epochs * -(-len(rows) // batch_size)
+    batches = Progress(_batches(rows, seeds, epochs, batch_size), f"training {len(seeds)} seeds", n_steps, unit="step")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        _step_together(heads, template.config, inputs, table, batches, n_steps)
+    finally:
+        torch.set_num_threads(threads)
     return [with_heads(template, its_heads) for its_heads in heads]
-
-
-def heldout_mse(
-    policies: Sequence[FrozenViTChunkPolicy],
-    dataset: LeRobotDataset,
-    held_out: Sequence[int],
-    preprocess: Callable[[dict], dict],
-) -> list[float | None]:
-    """Translation error of each policy on some demonstrations of a feature set, in m2; None where they are none.
-
-    Args:
-        policies: they differ in their heads alone.
-        dataset: any feature set with the inputs of the policies' own, by the same encoder.
-        held_out: numbers of the episodes.
-        preprocess: the policies' preprocessor, with the statistics of the set that they were trained on.
-    """
-    is_heldout = _is_among(dataset, held_out)
-    if not is_heldout.any():
-        return [None] * len(policies)
-    table = _read_table(policies[0], dataset, preprocess)
-    heldout = {name: column[is_heldout] for name, column in table.items()}
-    return [_mean_error(_reading_from(policy, dataset), heldout) for policy in policies]
 
 
 def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folder: Path) -> None:
@@ -94,34 +77,16 @@ def save_checkpoint(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, folde
         processor.save_pretrained(folder)
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Have torch compute in this thread alone for as long as the block takes."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-class _Order:
-    """The order in which one seed sees its samples: every row once per epoch."""
-
-    def __init__(self, rows: Tensor, seed: int, epochs: int, batch_size: int):
-        self.rows, self.epochs, self.batch_size = rows, epochs, batch_size
-        self.generator = torch.Generator().manual_seed(seed)
-
-    def epoch(self) -> Tensor:
-        return self.rows[torch.randperm(len(self.rows), generator=self.generator)]
-
-    @property
-    def n_steps(self) -> int:
-        return self.epochs * -(-len(self.rows) // self.batch_size)
+def _batches(rows: Tensor, seeds: Sequence[int], epochs: int, batch_size: int) -> Iterator[Tensor]:
+    """Yield batches of rows (S, B), a line for each seed: every row once per epoch, in the seed's own order."""
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
+    for _ in range(epochs):
+        orders = [rows[torch.randperm(len(rows), generator=generator)] for generator in generators]
+        yield from torch.stack(orders).split(batch_size, dim=1)
 
 
 def _is_among(dataset: LeRobotDataset, episodes: Sequence[int]) -> Tensor:
-    """Which rows (N,) belong to one of some episodes."""
+    """Return which rows (N,) belong to one of some episodes."""
     return torch.isin(_episodes(dataset), torch.tensor(list(episodes), dtype=torch.int64))
 
 
@@ -132,47 +97,29 @@ def _episodes(dataset: LeRobotDataset) -> Tensor:
 def _read_table(
     policy: FrozenViTChunkPolicy, dataset: LeRobotDataset, preprocess: Callable[[dict], dict]
 ) -> dict[str, Tensor]:
-    """The whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T).
+    """Return the whole set as one preprocessed batch: features (N, D), `action` (N, T, A), `action_is_pad` (N, T).
 
     Where the readout finds points, also where they are, (N, 2P).
     """
-    columns = dataset.hf_dataset.with_format("numpy")
-    names = policy.config.feature_key, "index", *policy.config.input_features
+    config, columns = policy.config, dataset.hf_dataset.with_format("numpy")
+    points = [config.point_key] if policy.readout.points else []
+    names = [config.feature_key, "index", *config.input_features, *points]
     table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
-    if policy.readout.points:
-        table[policy.config.point_key] = torch.as_tensor(columns[policy.config.point_key][:])
-    rows, last = _chunk_rows(_episodes(dataset), policy.config.chunk_size)
+    episodes = _episodes(dataset)
+    last = torch.searchsorted(episodes, episodes, right=True)[:, None] - 1
+    rows = torch.arange(len(episodes))[:, None] + torch.arange(config.chunk_size)
     table[ACTION] = torch.as_tensor(columns[ACTION][:])[rows.minimum(last)]
     table[f"{ACTION}_is_pad"] = rows > last
     return {name: value for name, value in preprocess(table).items() if torch.is_tensor(value)}
 
 
-def _chunk_rows(episodes: Tensor, chunk_size: int) -> tuple[Tensor, Tensor]:
-    """Rows (N, T) of the steps from every row on, and the last row (N, 1) of its episode."""
-    rows = torch.arange(len(episodes))
-    last = torch.searchsorted(episodes, episodes, right=True) - 1
-    return rows[:, None] + torch.arange(chunk_size), last[:, None]
-
-
 def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tuple[Tensor, ...]:
-    """What the heads see of every row; patch features that a readout learns from stay on the disk."""
+    """Return what the heads see of every row; patch features that a readout learns from stay on the disk."""
     state = (table[OBS_STATE],) if policy.config.use_state else ()
     if policy.readout.learns:
         return open_patches(policy.patches_root), *state
     pooled = [policy.head_inputs(rows)[0] for rows in _split(table)]
     return torch.cat(pooled), *state
-
-
-def _reading_from(policy: FrozenViTChunkPolicy, dataset: LeRobotDataset) -> FrozenViTChunkPolicy:
-    """The same policy, which looks for patch features in another data set's folder."""
-    reader = copy(policy)
-    reader.patches_root = dataset.root
-    return reader
-
-
-def _mean_error(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> float:
-    totals, counts = zip(*(policy.translation_error(rows) for rows in _split(table)), strict=True)
-    return sum(totals) / sum(counts)
 
 
 def _split(table: dict[str, Tensor], size: int = 256) -> Iterator[dict[str, Tensor]]:
@@ -192,24 +139,22 @@ def _step_together(
     config: FrozenViTChunkConfig,
     inputs: tuple[Tensor, ...],
     table: dict[str, Tensor],
-    orders: Sequence[_Order],
+    batches: Iterable[Tensor],
+    n_steps: int,
 ) -> None:
     """Train `heads` in place."""
-    preset, weights = config.get_optimizer_preset(), (config.regression_weight, config.point_weight)
+    preset, schedule = config.get_optimizer_preset(), config.get_scheduler_preset()
     labels = [table[name] for name in (ACTION, f"{ACTION}_is_pad", config.point_key) if name in table]
     stacked, _ = stack_module_state(list(heads))
     parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
     optimizer = preset.build(list(parameters.values()))
-    n_steps = orders[0].n_steps
-    schedule = config.get_scheduler_preset()
     scheduler = schedule.build(optimizer, n_steps) if schedule else None
-    most = sum(min(order.batch_size, len(order.rows)) for order in orders)
-    columns = [_Column(values, most, config.device) for values in inputs]
-    for batch in Progress(_batches(orders), f"training {len(heads)} seeds", n_steps, unit="step"):
+    columns = [_Column(values, config.device) for values in inputs]
+    for batch in batches:
         wanted = [label[batch] for label in labels]
         seen = [column.read(batch) for column in columns]
         made = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
-        losses = vmap(lambda *chunk: chunk_errors(*chunk, **config.losses).loss(*weights))(*made, *wanted)
+        losses, _ = vmap(partial(heads_loss, config))(*made, *wanted)
         optimizer.zero_grad()
         losses.sum().backward()
         _clip_each(parameters.values(), preset.grad_clip_norm)
@@ -227,26 +172,20 @@ class _Column:
 
     Args:
         values: the column, (N, ...).
-        size: rows of the largest batch.
         device: where the heads are.
     """
 
-    def __init__(self, values: Tensor, size: int, device: str):
+    def __init__(self, values: Tensor, device: str):
         self.values = values
-        self.rows = torch.empty(size, *values.shape[1:], dtype=values.dtype, device=values.device)
-        self.batch = torch.empty(size, *values.shape[1:], dtype=torch.float32, device=device)
+        self.rows = values.new_empty(0)
+        self.batch = torch.empty(0, device=device)
 
     def read(self, batch: Tensor) -> Tensor:
-        """Return the rows (S, B) as (S, B, ...) in float32, until the next batch is read."""
-        rows, seen = self.rows[: batch.numel()], self.batch[: batch.numel()]
+        """Return the rows (S, B) as (S, B, ...) in float32, until the next batch is read. The first is the largest."""
+        shape = batch.numel(), *self.values.shape[1:]
+        rows, seen = self.rows.resize_(shape), self.batch.resize_(shape)
         torch.index_select(self.values, 0, batch.flatten().to(self.values.device), out=rows)
         return seen.copy_(rows).unflatten(0, batch.shape)
-
-
-def _batches(orders: Sequence[_Order]) -> Iterator[Tensor]:
-    """Yield rows (S, B), one line per seed."""
-    for _ in range(orders[0].epochs):
-        yield from torch.stack([order.epoch() for order in orders]).split(orders[0].batch_size, dim=1)
 
 
 def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
@@ -259,7 +198,7 @@ def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
 
 
 def with_heads(template: FrozenViTChunkPolicy, heads: ChunkHeads) -> FrozenViTChunkPolicy:
-    """A copy of a policy with other heads and the same backbone."""
+    """Return a copy of a policy with other heads and the same backbone."""
     policy = deepcopy(template, {id(template.backbone): template.backbone})
     policy.heads = heads
     return policy

@@ -14,21 +14,15 @@ from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import read_parquet
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 
-from .backbone import IMAGE_SIZE, Backbone
-from .precision import PRECISIONS, RUNTIMES
+from .backbones import IMAGE_SIZE, Backbone
 
 FEATURE_PREFIX = "observation.features."
 
-POINT_PREFIX = "observation.points."
-
 PATCHES_FILE = "patch_features.npy"
-"""Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i that of `index` i."""
+"""Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i is the frame `index` i."""
 
 BOUND = "patches_sha256"
 """Name in the description of a feature column: `_identity` of the patch features beside it."""
-
-DESCRIBED = ("backbone", "weights_sha256", "precision", "readout", "preprocessing")
-"""What must agree between a feature set and the policy that reads it."""
 
 
 def feature_key(camera: str) -> str:
@@ -37,8 +31,8 @@ def feature_key(camera: str) -> str:
 
 
 def point_key(camera: str) -> str:
-    """Column that says where in the frames of `camera` the readout's points are, (2P,) float32 from -1 to 1."""
-    return POINT_PREFIX + camera
+    """Column that says where in the frames of `camera` a readout's points are, (2P,) float32 from -1 to 1."""
+    return f"observation.points.{camera}"
 
 
 def open_patches(root: Path) -> Tensor:
@@ -59,22 +53,21 @@ def open_patches(root: Path) -> Tensor:
 
 def bind_patches(root: Path) -> None:
     """Write into a feature set's description which patch features are its own."""
-    path = root / INFO
-    info = DATA_SET.read(path)
-    key = _described_in(info)
+    info = DATA_SET.read(root / INFO)
+    key = _feature_column(info)
     info["features"][key]["info"][BOUND] = _identity(root, key, np.load(root / PATCHES_FILE, mmap_mode="r"))
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    (root / INFO).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
 def close_patches() -> None:
-    """Let go of what `open_patches` has mapped: a removed file takes its room until then."""
+    """Release what `open_patches` has mapped. Until then a removed file still takes its room on the disk."""
     _mapped.cache_clear()
 
 
 @cache
 def _mapped(root: Path) -> Tensor:
     info = DATA_SET.read(root / INFO)
-    key = _described_in(info)
+    key = _feature_column(info)
     try:
         patches = np.load(root / PATCHES_FILE, mmap_mode="c")  # torch takes no read-only memory
     except (ValueError, EOFError) as error:
@@ -87,12 +80,8 @@ def _mapped(root: Path) -> Tensor:
     return torch.from_numpy(patches)
 
 
-def _described_in(info: Mapping) -> str:
-    """The column of features that a feature set was encoded to.
-
-    Raises:
-        InputError: there is none.
-    """
+def _feature_column(info: Mapping) -> str:
+    """Return the name of a feature set's column of features. Raises InputError where there is none."""
     for name in info["features"]:
         if name.startswith(FEATURE_PREFIX):
             return name
@@ -100,7 +89,7 @@ def _described_in(info: Mapping) -> str:
 
 
 def _identity(root: Path, key: str, patches: np.ndarray) -> str:
-    """What no other set has: the pooled features of all frames, and some rows of their patch features."""
+    """Hash the pooled features of all frames, and some rows of their patch features."""
     files = sorted((root / "data").glob("*/*.parquet"))
     pooled = np.concatenate([np.stack(read_parquet(file, [key]).to_pandas()[key]) for file in files])
     total = hashlib.sha256(f"{pooled.shape} {patches.shape}".encode())
@@ -117,13 +106,11 @@ def describe(
     crop: Sequence[float] | None = None,
     blind: bool = False,
 ) -> dict[str, str | None]:
-    """Say how features are made: the column's `info`, compared before a policy trains on them."""
+    """Return the description of an encoder's features, a column's `info`. A policy that reads them compares it."""
     resize = f"bicubic antialiased to {IMAGE_SIZE}x{IMAGE_SIZE} if of another size"
-    pixels = ["[0, 1]", resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
-    if crop is not None:
-        pixels.insert(1, f"crop {[float(edge) for edge in crop]}")
-    if blind:
-        pixels.insert(0, "grey in place of the image")
+    cropped = [] if crop is None else [f"crop {[float(edge) for edge in crop]}"]
+    seen = ["grey in place of the image", "[0, 1]"] if blind else ["[0, 1]"]
+    pixels = [*seen, *cropped, resize, f"mean {list(backbone.mean)}", f"std {list(backbone.std)}"]
     return {
         "backbone": backbone.name,
         "weights_sha256": weights_sha256,
@@ -133,19 +120,18 @@ def describe(
     }
 
 
-def made_in(column: Mapping | None) -> str | None:
-    """The precision of a feature column's encoder; None where there is no column or it does not say."""
-    return _said(column, "precision", PRECISIONS)
+def stated(column: Mapping | None, name: str, known: Sequence[str] | None = None) -> str | None:
+    """Return what the description of a feature column states by some name.
 
+    Args:
+        column: the column's entry in the data set's `features`.
+        known: the values that count; by default every text.
 
-def computed_by(column: Mapping | None) -> str | None:
-    """What computed a feature column; None where there is no column or it does not say."""
-    return _said(column, "runtime", RUNTIMES)
-
-
-def _said(column: Mapping | None, name: str, known: Sequence[str]) -> str | None:
+    Returns:
+        None where there is no column, or it states nothing that counts.
+    """
     found = ((column or {}).get("info") or {}).get(name)
-    return found if found in known else None
+    return found if isinstance(found, str) and (known is None or found in known) else None
 
 
 def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> None:
@@ -159,11 +145,11 @@ def check_features(column: Mapping, expected: Mapping[str, str], dim: int) -> No
     Raises:
         ValueError: the column is described differently, or not at all.
     """
-    found = column.get("info") or {}
+    found = {name: stated(column, name) for name in expected}
     different = [
-        f"{name} {found.get(name, 'not stated')} (the policy: {expected[name]})"
-        for name in DESCRIBED
-        if found.get(name) != expected[name]
+        f"{name} {found[name] or 'not stated'} (the policy: {wanted})"
+        for name, wanted in expected.items()
+        if found[name] is None or found[name] != wanted
     ]
     if tuple(column["shape"]) != (dim,):
         different.append(f"shape {tuple(column['shape'])} (the policy: {(dim,)})")

@@ -17,7 +17,7 @@ from transformers import (
 )
 
 from lerobot_constructskill.features.encode import load_encoder
-from lerobot_constructskill.policies.frozen_vit import zoo
+from lerobot_constructskill.policies.frozen_vit import backbones
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES, check_backbone, get_backbone
 
 TIMM = (
@@ -110,7 +110,7 @@ def test_a_name_that_nothing_can_have_is_refused_before_anything_is_looked_for(n
 
 
 def test_what_cannot_be_had_is_one_sentence(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(zoo, "hub_file", lambda *_: None)  # stands in for a machine that does not reach the Hub
+    monkeypatch.setattr(backbones, "hub_file", lambda *_: None)  # stands in for a machine that does not reach the Hub
     caplog.set_level(logging.INFO)
     (tmp_path / "config.json").write_text("{}")
     (tmp_path / "preprocessor_config.json").write_text("{}")
