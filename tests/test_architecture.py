@@ -78,7 +78,7 @@ ARROWS = {
     "board.films": ("artifacts", "contract"),
     "board.entries": ("analysis.stats", "contract"),
     "board.exports": ("artifacts", "contract"),
-    "board.site": ("analysis.report.wording", "artifacts", "contract"),
+    "board.site": ("analysis.report.formats", "artifacts", "contract"),
     "analysis": (),
     "analysis.stats": ("study.rows",),
     "analysis.report": ("artifacts", "study.rows"),

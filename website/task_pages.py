@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_constructskill.analysis.report.page import read_study
 from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
-from lerobot_constructskill.analysis.stats.outcomes import Counts, count, seed_outcomes
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     CAMERAS,
@@ -155,16 +155,16 @@ def baselines(root: Path) -> pd.DataFrame:
 
 
 def lines(folder: Path) -> list[dict]:
-    heading, rows = read_study(folder)
+    name, analysis, rows = read_study(folder)
     settings = yaml.safe_load((folder / "study.yaml").read_text())["settings"]
-    runs = seed_outcomes(rows[rows["error_kind"].isna()])
+    runs = runs_of(rows[rows["error_kind"].isna()])
     roles = rows.groupby("variant")["role"].first()
     groups = sorted(runs.groupby(["setting", "variant"], sort=False), key=lambda group: roles[group[0][1]] != VARIANT)
     return [
         {
             "task": settings[setting]["env"].get("task", "brick_to_bin"),
-            "study": heading.name,
-            "label": heading.analysis.label(variant),
+            "study": name,
+            "label": analysis.label(variant),
             "lifted": "{}/{}".format(*count(own, "lifted")),
             "placed": "{}/{}".format(*count(own, "placed")),
             "episodes_placed": own["placed"].sum(),
