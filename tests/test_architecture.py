@@ -82,7 +82,14 @@ ARROWS = {
     "analysis": (),
     "analysis.stats": ("study.rows",),
     "analysis.report": ("artifacts", "study.rows"),
-    "comparison": ("analysis.stats", "contract", "envs.recording", "perturbations", "study.rows"),
+    "comparison": (
+        "analysis.report.formats",
+        "analysis.stats",
+        "contract",
+        "envs.recording",
+        "perturbations",
+        "study.rows",
+    ),
     "comparison.evaluate": ("artifacts", "contract", "envs.recording", "rollout", "training"),
     "scripts": (
         "analysis",

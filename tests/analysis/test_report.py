@@ -211,7 +211,10 @@ def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_f
 def test_declared_comparisons_are_the_family(tmp_path):
     findings = findings_of(STUDY, study_rows(), tmp_path, comparisons=[["clip", "dinov2"], ["augreg", "dinov2"]])
     fixed, moved = findings.settings
-    assert [(pair.a, pair.b) for pair in fixed.count_comparisons["placed"]] == [("clip", "dinov2"), ("augreg", "dinov2")]
+    assert [(pair.a, pair.b) for pair in fixed.count_comparisons["placed"]] == [
+        ("clip", "dinov2"),
+        ("augreg", "dinov2"),
+    ]
     assert moved.declared == 1  # augreg does not run there
 
 

@@ -1,7 +1,7 @@
 """Compares two sides, each of some training seeds that were evaluated on the same starts."""
 
+from dataclasses import dataclass
 from math import comb, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from lerobot_constructskill.analysis.stats.power import (
 from lerobot_constructskill.analysis.stats.spread import PERMUTATIONS, mean_p_value, mean_rate
 
 
-class Judgement(NamedTuple):
+@dataclass(frozen=True)
+class Judgement:
     """What the seeds show of side a against side b.
 
     Args:
