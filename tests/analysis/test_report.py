@@ -68,7 +68,7 @@ def test_page_holds_the_papers_tables_and_every_figure(study):
     text = re.sub(r"\s+", " ", " ".join(reader.text))
     for words in ("10 training seeds each", "DINOv2 ViT-S/14, first 3 seeds", "Position ± 0.10 m", "Scripted expert"):
         assert words in text
-    drawn = {f"{setting}_{kind}.png" for setting in RATES for kind in ("success", "seeds", "error")}
+    drawn = {f"{setting}_{kind}.png" for setting in RATES for kind in ("seeds", "error")}
     assert {path.name for path in (study / "figures").iterdir()} == drawn
     assert {link for link in reader.links if "figures" in link} == {f"figures/{name}" for name in drawn}
     assert (study / "study.yaml").read_text() in "".join(reader.text)
@@ -302,7 +302,7 @@ def test_report_is_the_same_twice(tmp_path):
     rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, 1, run[2])]
     root = write_study(tmp_path, SMALL, rows)
     first, second = ({path: path.read_bytes() for path in files(root)} for _ in range(2))
-    assert first == second and len(first) == 6
+    assert first == second and len(first) == 5
 
 
 def files(root: Path) -> list[Path]:

@@ -13,7 +13,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lerobot_constructskill.analysis.report.findings import Findings, SettingFindings, Sweep, VariantFindings
+from lerobot_constructskill.analysis.report.findings import Findings, SettingFindings, Sweep
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA
 from lerobot_constructskill.artifacts.folders import replaced
 
@@ -33,12 +33,11 @@ SHADES = 64
 
 
 def write_figures(findings: Findings, folder: Path) -> None:
-    """Write the figures as PNG: `<setting>_success`, `<setting>_seeds` and `<setting>_error`, and `sweeps`."""
+    """Write the figures as PNG: `<setting>_seeds` and `<setting>_error`, and `sweeps`."""
     folder.mkdir(exist_ok=True)
     with matplotlib.rc_context(fname=STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a label may be in any script
         for setting in findings.sections:
-            save(success_figure(setting), folder / f"{setting.name}_success.png")
             save(seeds_figure(setting, findings.episodes), folder / f"{setting.name}_seeds.png")
             if setting.validated:
                 save(error_figure(setting, findings.episodes), folder / f"{setting.name}_error.png")
@@ -52,24 +51,6 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(drawn)
     with replaced(path) as partial:
         Image.open(drawn).convert("RGB").quantize(SHADES).save(partial, format="png", optimize=True)
-
-
-def success_figure(setting: SettingFindings) -> Figure:
-    """Share of seeds that met each criterion, with its interval; references as diamonds."""
-    figure, axes = _panels(0.9 + 0.32 * len(setting.everything), sharey=True)
-    for axis, criterion in zip(axes, CRITERIA, strict=True):
-        for y, one in enumerate(setting.everything):
-            if not one.success:
-                continue
-            share, low, high = one.success[criterion].exact
-            above = {"clip_on": False, "zorder": 3}  # the axes' lines pass below the marks at 0 and 1
-            if one in setting.references:
-                axis.plot(share, y, "D", color=MUTED, markerfacecolor="white", **above)
-            else:
-                axis.errorbar(share, y, xerr=[[share - low], [high - share]], color="C0", marker="o", **above)
-        axis.set(title=criterion.capitalize(), xlabel="share of seeds", xlim=(0, 1))
-    _name_rows(axes[0], setting.everything)
-    return figure
 
 
 def seeds_figure(setting: SettingFindings, episodes: int) -> Figure:
@@ -95,7 +76,8 @@ def seeds_figure(setting: SettingFindings, episodes: int) -> Figure:
         axis.grid(visible=False)
         axis.tick_params(length=0)
         axis.spines[:].set_visible(False)
-    _name_rows(axes[0], setting.variants, 0.5)
+    axes[0].set_yticks(np.arange(len(setting.variants)) + 0.5, [fill(one.label, 24) for one in setting.variants])
+    axes[0].invert_yaxis()
     return figure
 
 
@@ -139,12 +121,6 @@ def _panels(height: float, rows: int = 1, columns: int = 2, **shared) -> tuple[F
     """A figure of `height` inches and its axes in reading order."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
-
-
-def _name_rows(axis: Axes, variants: list[VariantFindings], first: float = 0) -> None:
-    """Write the variants' labels at the left, from the top."""
-    axis.set_yticks(np.arange(len(variants)) + first, [fill(one.label, 24) for one in variants])
-    axis.set_ylim(len(variants) - 0.5 + first, first - 0.5)
 
 
 def _cell(met: float, failed: bool, episodes: int) -> tuple[str, str]:
