@@ -114,8 +114,12 @@ def commands(scripts: dict[str, str]) -> str:
 def help_of(name: str, target: str) -> str:
     """The text that a command prints for `--help`."""
     main, printed = import_module(target.partition(":")[0]).main, io.StringIO()
-    asked = patch.object(sys, "argv", [name, "--help"]), patch.dict("os.environ", COLUMNS="100")
-    with redirect_stdout(printed), suppress(SystemExit), asked[0], asked[1]:
+    with (
+        redirect_stdout(printed),
+        suppress(SystemExit),
+        patch.object(sys, "argv", [name, "--help"]),
+        patch.dict("os.environ", COLUMNS="100"),
+    ):
         main()
     return printed.getvalue()
 

@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from itertools import cycle
 from pathlib import Path
 from textwrap import fill
 
@@ -93,6 +94,7 @@ def error_figure(setting: SettingFindings, episodes: int) -> Figure:
         axis.set(title=criterion.capitalize(), xlabel="held-out translation error (10⁻⁴ m²)")
     if max(one.error.high for one in variants) > 10 * min(one.error.low for one in variants) > 0:
         axes[0].set_xscale("log")
+        axes[0].xaxis.set_major_formatter("{x:g}")
     axes[0].set(ylabel=f"episodes of {episodes}", ylim=(-0.08 * episodes, 1.08 * episodes))
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return figure
@@ -104,7 +106,7 @@ def sweeps_figure(findings: Findings) -> Figure:
     rows = -(-len(sweeps) // columns)
     figure, axes = _panels(0.5 + 2.4 * rows, rows, columns, sharey=True)
     for axis, sweep in zip(axes, sweeps, strict=False):
-        for label, style in zip(findings.swept_labels, matplotlib.rcParams["axes.prop_cycle"], strict=False):
+        for label, style in zip(findings.swept_labels, cycle(matplotlib.rcParams["axes.prop_cycle"]), strict=False):
             _draw_along(axis, sweep, label, style)
         names = [fill(setting.label, 10, break_long_words=False) for setting in sweep.settings]
         axis.set_xticks(range(len(names)), names, fontsize=7.5)

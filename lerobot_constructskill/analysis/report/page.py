@@ -125,7 +125,7 @@ def _is_inside(root: Path, video: str) -> bool:
 def _outcome(row: pd.Series) -> str:
     """ "seed 0, episode 0: placed at step 180"."""
     steps = {"placed": row["place_step"], "lifted": row["lift_step"]}
-    stage = next((stage for stage in steps if row[stage] is not pd.NA and row[stage]), "not lifted")
+    stage = next((stage for stage in steps if pd.notna(row[stage]) and row[stage]), "not lifted")
     at = f" at step {steps[stage]}" if pd.notna(steps.get(stage)) else ""
     return f"seed {row['training_seed']}, episode {row['episode']}: {stage}{at}{', not placed' * (stage == 'lifted')}"
 
