@@ -1,4 +1,4 @@
-"""How a study is to be read: the `analysis` section of its file, which decides nothing that is run."""
+"""The `analysis` section of a study's file: labels, order and comparisons of its report. It changes no run."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
@@ -17,17 +17,17 @@ class Analysis:
     """Labels, order and tests of a report.
 
     Args:
-        labels: name of a setting, variant, reference or sweep to what tables call it; the name itself by default.
-        order: variants that stand first, in this order; the others follow as they stand in the study.
-        comparisons: pairs of variants that the study declares it will test, the family that Holm's correction covers;
-            every pair with equally many planned seeds by default.
-        alpha: level of those tests.
-        sweeps: name of what is varied to the settings that differ in it, the one without it first. They stand
-            beside it in one table and one figure, in place of a section each where there is one variant and so nothing
-            to compare. Variants with the same label are one line.
+        labels: name of a setting, variant, reference or sweep to its name in tables; the name itself by default.
+        order: variants that come first, in this order; the others follow in the order of the study.
+        comparisons: pairs of variants to test, the family that Holm's correction covers; by default every pair with
+            equally many planned seeds.
+        alpha: level of the tests.
+        sweeps: name of what is varied to the settings that differ in it, the one without the variation first. They
+            share a table and a figure, and have a section each only if they compare variants. Variants with the same
+            label are one line.
 
     Raises:
-        InputError: no such tests can be made.
+        InputError: a comparison is no pair or declared twice, or a sweep has fewer than two settings.
     """
 
     labels: dict[str, Text] = field(default_factory=dict)
@@ -48,10 +48,10 @@ class Analysis:
                 raise InputError(f"A sweep must be two settings or more, each once; '{name}' is {settings}.")
 
     def check(self, variants: Collection[str], settings: Collection[str], references: Collection[str] = ()) -> None:
-        """Refuse names that the study does not have.
+        """Check that the study has every name.
 
         Raises:
-            InputError: a name is unknown.
+            InputError: a name is unknown, or a sweep has the name or the first setting of something else.
         """
         _check_known("variant in comparisons", chain.from_iterable(self.comparisons or []), variants)
         _check_known("variant in order", self.order, variants)
@@ -65,13 +65,13 @@ class Analysis:
                 raise InputError(f"'{swept[0]}' begins the sweep '{name}' and must not be varied in another.")
 
     def check_settings(self, variants_in: Mapping[str, Collection[str]]) -> None:
-        """Refuse what could be told nowhere, or not apart.
+        """Check comparisons and labels against the variants of each setting.
 
         Args:
-            variants_in: name of a setting to the variants that run in it.
+            variants_in: setting to the variants that run in it.
 
         Raises:
-            InputError: the variants of a comparison never meet, or two of a setting have one label.
+            InputError: two compared variants share no setting, or two variants of a setting have one label.
         """
         for pair in self.comparisons or []:
             if not any({*pair} <= {*variants} for variants in variants_in.values()):
@@ -81,10 +81,11 @@ class Analysis:
                 raise InputError(f"Two variants in the setting '{setting}' have the label '{twice[0]}'.")
 
     def label(self, name: str) -> str:
+        """The name in tables."""
         return self.labels.get(name, name)
 
     def rank(self, variant: str) -> int:
-        """Where a variant stands; equal for those that `order` does not name."""
+        """Place of a variant in `order`; equal for all variants that it does not name."""
         return self.order.index(variant) if variant in self.order else len(self.order)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report.wording import percent, share_range
+from lerobot_constructskill.analysis.report.formats import percent, share_range
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports

@@ -1,25 +1,21 @@
-"""Checkpoints of any LeRobot policy, evaluated where the other side was."""
+"""Evaluates checkpoints of any LeRobot policy where the other side was evaluated."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import batched
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.digests import versions
-from lerobot_constructskill.artifacts.processor import make, processor
-from lerobot_constructskill.comparison.sides import MAKER, Conditions, Side, merge_versions
+from lerobot_constructskill.comparison.read import Source, recorded_side
+from lerobot_constructskill.comparison.sides import Side, conditions
 from lerobot_constructskill.envs.recording import RECORDINGS, write_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
-from lerobot_constructskill.training.checkpoints import ACTING, check_inputs
-from lerobot_constructskill.training.trainers import versions_of
+from lerobot_constructskill.rollout.lockstep import roll_out
+from lerobot_constructskill.training.checkpoints import check_inputs
 
 
 def evaluate(
-    name: str,
-    checkpoints: Sequence[Path],
+    source: Source,
     env: Mapping[str, Any],
     starts: Sequence[int],
     together: int,
@@ -29,49 +25,39 @@ def evaluate(
     """Run every checkpoint through an episode from each start.
 
     Args:
-        name: what the side is called.
-        checkpoints: folders of checkpoints, one for each training seed.
+        source: folders of checkpoints, one for each training seed.
         env: keyword arguments of `ConstructSkillEnv`.
         starts: seeds of the episodes.
-        together: policies that are in memory at a time.
-        device: in place of the one in the checkpoints.
-        kept_in: folder for recordings, in one folder for each checkpoint; none are kept by default.
+        together: number of policies in memory at a time.
+        device: device in place of the one in the checkpoints.
+        kept_in: folder for recordings, with a folder for each checkpoint; none are kept by default.
 
     Raises:
-        InputError: a checkpoint cannot be loaded, reads what it would not be shown, or failed in an episode.
+        InputError: a checkpoint cannot be loaded, reads an observation that it would not get, or failed in an episode.
         OSError: a simulator's process died.
     """
-    seeds, told = [], []
-    for group in batched(checkpoints, together):  # noqa: B911  the last one may be smaller
-        for checkpoint, agent, rollout in _roll_out(group, env, starts, device):
-            seeds.append({episode.evaluation_seed: episode.placed for episode in rollout.episodes})
-            packages = versions(*ACTING) | code_of(roll_out.__module__) | versions_of(agent.policy.config)
-            told.append(packages | {"processor": processor(), MAKER: make(), "backend": rollout.backend})
+    perturbation = {"perturb": env.get("perturb") or "", "perturb_seed": env.get("perturb_seed") or 0}
+    facts = conditions(env) | perturbation
+    by_folder = {}
+    for group in batched(source.folders, together):  # noqa: B911  the last one may be smaller
+        agents = [PolicyAgent.from_pretrained(checkpoint, device) for checkpoint in group]
+        for checkpoint, agent in zip(group, agents, strict=True):
+            try:
+                check_inputs(agent.policy.config, facts["obs_type"])
+            except InputError as error:
+                raise InputError(f"'{checkpoint}': {error}") from None
+        rollouts = dict(roll_out(agents, env, starts))
+        for number, checkpoint in enumerate(group):
+            if (error := rollouts[number].error) is not None:
+                said = " ".join(f"{type(error).__name__}: {error}".split())
+                raise InputError(f"The checkpoint '{checkpoint}' failed in its evaluation ({said}).") from error
+            recordings = by_folder[checkpoint] = rollouts[number].recordings(facts)
             if kept_in is not None:
-                folder = kept_in / f"{len(seeds) - 1:02d}_{_label(checkpoint)}"
-                write_recordings(rollout.recordings(vars(Conditions.of(env))), folder / RECORDINGS)
-    kind = f"{plural(len(checkpoints), 'checkpoint')}, evaluated now"
-    return Side(name, kind, env, seeds, merge_versions(told))
-
-
-def _roll_out(
-    checkpoints: Sequence[Path], env: Mapping[str, Any], starts: Sequence[int], device: str | None
-) -> Iterator[tuple[Path, PolicyAgent, Rollout]]:
-    agents = [PolicyAgent.from_pretrained(checkpoint, device) for checkpoint in checkpoints]
-    for checkpoint, agent in zip(checkpoints, agents, strict=True):
-        try:
-            check_inputs(agent.policy.config, Conditions.of(env).obs_type)
-        except InputError as error:
-            raise InputError(f"'{checkpoint}': {error}") from None
-    rollouts = dict(roll_out(agents, env, starts))  # each as it ends
-    for number, (checkpoint, agent) in enumerate(zip(checkpoints, agents, strict=True)):
-        if (error := rollouts[number].error) is not None:
-            said = " ".join(f"{type(error).__name__}: {error}".split())
-            raise InputError(f"The checkpoint '{checkpoint}' failed where it is evaluated ({said}).") from error
-        yield checkpoint, agent, rollouts[number]
+                write_recordings(recordings, kept_in / f"{len(by_folder) - 1:02d}_{_label(checkpoint)}" / RECORDINGS)
+    return recorded_side(source.name, f"{plural(len(by_folder), 'checkpoint')}, evaluated now", by_folder)
 
 
 def _label(checkpoint: Path) -> str:
-    """The folder that tells a checkpoint from those of other seeds, such as seed_0."""
-    names = [part for part in checkpoint.absolute().parts if part not in ("checkpoints", "last", "pretrained_model")]
-    return names[-1]
+    """Name of the folder that tells a checkpoint from those of other seeds, such as seed_0."""
+    parts = checkpoint.absolute().parts
+    return [part for part in parts if part not in ("checkpoints", "last", "pretrained_model")][-1]

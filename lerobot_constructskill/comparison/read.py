@@ -1,24 +1,94 @@
-"""What a comparison can read without running anything: a study's folder, recordings, and `lerobot-eval`'s results."""
+"""Finds a side of a comparison from what the user typed, and reads those that need no evaluation."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from glob import glob
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from lerobot_constructskill.comparison.sides import MAKER, Conditions, Outcomes, Side, merge_versions, read_versions
+from lerobot_constructskill.comparison.sides import Placements, Side, check_equal, conditions, merge_versions
 from lerobot_constructskill.contract import LOOSE, SUITES
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, read_recordings
-from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.lerobot_internals import EVALUATED
+from lerobot_constructskill.errors import InputError, MissingError, plural
+from lerobot_constructskill.lerobot_internals import EVALUATED as EVAL_INFO
+from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_environments, read_rows
 
-EVAL_INFO = "eval_info.json"
-"""What `lerobot-eval` writes into its output folder."""
+IN_STUDY, CHECKPOINT, RECORDED, EVALUATED = "study", "checkpoint", "recordings", "lerobot-eval"
+"""Kinds of sources."""
+
+CONTENTS = (
+    (CHECKPOINT, Path(), "config.json"),
+    (CHECKPOINT, LAST_CHECKPOINT, "config.json"),
+    (CHECKPOINT, Path("pretrained_model"), "config.json"),
+    (RECORDED, Path(), "[!.]*.parquet"),
+    (EVALUATED, Path(), "eval_info.json"),
+)
+"""Kind, inner folder, and a file in it. Recordings come first, as they say more than results of `lerobot-eval`."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a side is read from.
+
+    Args:
+        name: what the user typed.
+        kind: `IN_STUDY`, `CHECKPOINT`, `RECORDED` or `EVALUATED`.
+        folders: the study's folder, or one folder for each training seed.
+        arm: setting/variant of a study.
+    """
+
+    name: str
+    kind: str
+    folders: tuple[Path, ...]
+    arm: str = ""
+
+
+def find(text: str) -> Source:
+    """Find the source of a side.
+
+    Args:
+        text: a study's folder, ":" and setting/variant; or folders separated by commas, or patterns such as
+            `outputs/mine/train/seed_*`, of checkpoints, of `lerobot-train`, of `lerobot-eval` or of recordings.
+
+    Raises:
+        MissingError: there is no such folder.
+        InputError: the folders hold nothing of this, are of several kinds, or one is named twice.
+    """
+    root, _, arm = text.rpartition(":") if ":" in text else (text, "", "")
+    if (Path(root) / STUDY).is_file():
+        return Source(text, IN_STUDY, (Path(root),), arm)
+    found: list[tuple[str, Path]] = []
+    for pattern in text.split(","):
+        folders = sorted(Path(name) for name in glob(pattern.strip()) if Path(name).is_dir())
+        if not folders:
+            raise MissingError(f"There is no folder '{pattern.strip()}'.")
+        found += map(_recognize, folders)
+    kinds, folders = zip(*found, strict=True)
+    if len(set(kinds)) > 1:
+        raise InputError(f"'{text}' is of several kinds ({', '.join(sorted({*kinds}))}); a side is of one kind.")
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError(f"'{text}' names a folder twice; each training seed counts once.")
+    return Source(text, kinds[0], folders)
+
+
+def _recognize(folder: Path) -> tuple[str, Path]:
+    """The kind of a folder, and the folder in it to read."""
+    for kind, inner, file in CONTENTS:
+        if any((folder / inner).glob(file)):
+            return kind, folder / inner
+    raise InputError(
+        f"'{folder}' is no checkpoint (config.json), no output of lerobot-train ({LAST_CHECKPOINT}) or lerobot-eval "
+        "(eval_info.json), and has no recordings (*.parquet)."
+    )
 
 
 def read_study(root: Path, arm: str) -> Side:
-    """The training seeds of a setting/variant, or setting/reference, of a study's folder that have been run.
+    """Read those training seeds of a study's setting/variant, or setting/reference, that were run.
 
     Raises:
         MissingError: the folder is not that of a study.
@@ -33,109 +103,98 @@ def read_study(root: Path, arm: str) -> Side:
     rows = rows[(arms == arm) & (rows["error_kind"].fillna("") != NOT_RUN)]
     if rows.empty:
         raise InputError(f"No run of '{arm}' in '{root}' has been made.")
+    setting, envs = arm.partition("/")[0], read_environments(root)
+    if setting not in envs:
+        raise InputError(f"'{root / STUDY}' does not say how '{setting}' is evaluated.")
+    made_with = rows[["versions", "backend"]].drop_duplicates().fillna("").itertuples(index=False)
     return Side(
         name=f"{root}:{arm}",
         kind=f"{plural(rows['training_seed'].nunique(), 'training seed')} of a study",
-        env=_env(root, arm.partition("/")[0]),
-        seeds=[_outcomes(own) for _, own in rows.groupby("training_seed", sort=True)],
-        versions=merge_versions(
-            read_versions(None if pd.isna(text) else text, backend=None if pd.isna(backend) else backend)
-            for text, backend in rows[["versions", "backend"]].drop_duplicates().itertuples(index=False)
-        ),
+        env=envs[setting],
+        seeds=[_placements_of_rows(own) for _, own in rows.groupby("training_seed", sort=True)],
+        versions=merge_versions(_versions(text, backend) for text, backend in made_with),
     )
 
 
-def _env(root: Path, setting: str) -> dict:
-    envs = read_environments(root)
-    if setting not in envs:
-        raise InputError(f"'{root / STUDY}' does not say how '{setting}' is evaluated.")
-    return envs[setting]
-
-
-def _outcomes(rows: pd.DataFrame) -> Outcomes | None:
+def _placements_of_rows(rows: pd.DataFrame) -> Placements | None:
     if rows["error_kind"].notna().any():
         return None
     if rows["placed"].isna().any() or rows["evaluation_seed"].duplicated().any():
         raise InputError(f"The rows of {rows['variant'].iloc[0]} lack a placement, or have two of one start.")
-    return {int(start): bool(placed) for start, placed in zip(rows["evaluation_seed"], rows["placed"], strict=True)}
+    return dict(zip(rows["evaluation_seed"].astype(int), rows["placed"].astype(bool), strict=True))
 
 
-def recordings_in(folder: Path) -> list[Path]:
-    """The files in a folder that recordings may be in: a study's run has one, $CONSTRUCTSKILL_RECORD many."""
-    whole = folder / RECORDINGS
-    return [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
+def _versions(text: str, backend: str) -> dict[str, str]:
+    return json.loads(text or "{}") | ({"backend": backend} if backend else {})
 
 
 def read_recorded(name: str, folders: Sequence[Path]) -> Side:
-    """Episodes that were recorded by $CONSTRUCTSKILL_RECORD, a folder for each training seed.
+    """Read episodes that $CONSTRUCTSKILL_RECORD wrote, in a folder for each training seed.
 
     Raises:
         InputError: a file is no recording, a folder has two of one start, or the episodes differ in their conditions.
     """
-    by_folder = {folder: list(chain(*map(read_recordings, recordings_in(folder)))) for folder in folders}
-    every = [one for recordings in by_folder.values() for one in recordings]
-    envs = [{name: getattr(one, name) for name in STARTING} for one in every]
+    by_folder = {}
+    for folder in folders:
+        whole = folder / RECORDINGS  # a study's run has this file alone, $CONSTRUCTSKILL_RECORD writes many
+        files = [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
+        by_folder[folder] = list(chain(*map(read_recordings, files)))
+    return recorded_side(name, f"recordings of {plural(len(folders), 'training seed')}", by_folder)
+
+
+def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Recording]]) -> Side:
+    """Make a side of recordings, by the folder of each training seed. Raises as `read_recorded` does."""
+    recordings = list(chain(*by_folder.values()))
+    envs = [{name: getattr(one, name) for name in STARTING} for one in recordings]
     for env in envs:
-        if different := Conditions.of(envs[0]).differences(Conditions.of(env)):
-            raise InputError(f"The recordings of '{name}' differ in {', '.join(different)}; a side needs one of each.")
-    return Side(
-        name=name,
-        kind=f"recordings of {plural(len(folders), 'training seed')}",
-        env=envs[0],
-        seeds=[_recorded(folder, recordings) for folder, recordings in by_folder.items()],
-        versions=merge_versions(_versions_of(one) for one in every),
-    )
+        check_equal(f"The recordings of '{name}'", envs[0], env)
+    for folder, own in by_folder.items():
+        starts = [one.evaluation_seed for one in own]
+        if twice := [start for start in starts if starts.count(start) > 1]:
+            raise InputError(
+                f"'{folder}' has two recordings of start {twice[0]}: record each training seed into its own folder."
+            )
+    versions = merge_versions(_versions(one.versions, one.backend) for one in recordings)
+    if "processor" in versions:
+        versions["processor's maker"] = versions.pop("processor")  # in a study's rows, "processor" is its full name
+    seeds = [{one.evaluation_seed: one.placed for one in own} for own in by_folder.values()]
+    return Side(name, kind, envs[0], seeds, versions)
 
 
-def _versions_of(recording: Recording) -> dict[str, str]:
-    told = read_versions(recording.versions, backend=recording.backend)
-    return {MAKER if name == "processor" else name: value for name, value in told.items()}
+def read_evaluated(name: str, folders: Sequence[Path], first_start: int | None, env: Mapping[str, Any]) -> Side:
+    """Read episodes of one task from output folders of `lerobot-eval`, one for each training seed.
 
-
-def _recorded(folder: Path, recordings: list[Recording]) -> Outcomes:
-    starts = [one.evaluation_seed for one in recordings]
-    if twice := [start for start in starts if starts.count(start) > 1]:
-        raise InputError(
-            f"'{folder}' has two recordings of start {twice[0]}: record each training seed into a folder of its own."
-        )
-    return {one.evaluation_seed: one.placed for one in recordings}
-
-
-def read_evaluated(name: str, folders: Sequence[Path], first_start: int | None, task: str | None, label: str) -> Side:
-    """Episodes of one task in output folders of `lerobot-eval`, one for each training seed.
-
-    LeRobot writes whether each episode succeeded. Its start, task, length and observation it does not write: whoever
-    calls has to know them.
+    LeRobot writes whether each episode succeeded. It does not write starts, episode length and observation.
 
     Args:
         first_start: the `--seed` that `lerobot-eval` was given; episode i starts from that plus i.
-        task: the task, where there is more than one in the folders.
-        label: of the perturbation, which LeRobot keeps in the names of its results.
+        env: keyword arguments of the `ConstructSkillEnv` that it evaluated in.
 
     Raises:
-        InputError: a folder's file is not `lerobot-eval`'s, has not that task, or no start is given.
+        InputError: a folder's file is not `lerobot-eval`'s, lacks the task, or no start is given.
     """
     if first_start is None:
         raise InputError(
             f"'{name}' is of lerobot-eval, which does not write from which starts it evaluated: add --seed, as it was "
             "given to lerobot-eval (1000 where it was not)."
         )
-    successes = [_successes(folder / EVAL_INFO, task, label) for folder in folders]
-    seeds = [dict(enumerate(own, first_start)) for own in successes]
+    seeds = [dict(enumerate(_successes(folder / "eval_info.json", env), first_start)) for folder in folders]
     return Side(name=name, kind=f"lerobot-eval's results of {plural(len(folders), 'training seed')}", seeds=seeds)
 
 
-def _successes(file: Path, task: str | None, label: str) -> list[bool]:
-    told = EVALUATED.read(file)["per_task"]
-    results = {(one["task_group"], one["task_id"]): one["metrics"]["successes"] for one in told}
-    if len(results) < len(told):
+def _successes(file: Path, env: Mapping[str, Any]) -> list[bool]:
+    """Successes of the task, whose perturbation LeRobot keeps in the names of its results."""
+    task, label = env["task"], conditions(env)["perturbation"]
+    results = EVAL_INFO.read(file)["per_task"]
+    found = {(one["task_group"], one["task_id"]): one["metrics"]["successes"] for one in results}
+    if len(found) < len(results):
         raise InputError(f"'{file}' has two results of one task.")
-    suites = {f"{suite}{label}": tasks for suite, tasks in SUITES.items()}
-    ours = {key: own for key, own in results.items() if key[0] in suites or key[0] == f"{LOOSE}{label}"}
-    if len(ours) == 1 and next(iter(ours))[0] == f"{LOOSE}{label}":
-        return next(iter(ours.values()))
-    for (suite, number), own in ours.items():
-        if suites.get(suite, ())[number : number + 1] == (task,) and number >= 0:
-            return own
-    found = ", ".join(f"{suite} {number}" for suite, number in results)
-    raise InputError(f"{file} has no result that is of {task or 'one task'}{label} for certain; it has: {found}.")
+    ours = [key for key in found if key[0] in {f"{suite}{label}" for suite in (*SUITES, LOOSE)}]
+    of_task = [(f"{suite}{label}", tasks.index(task)) for suite, tasks in SUITES.items() if task in tasks]
+    if len(ours) == 1 and ours[0][0] == f"{LOOSE}{label}":
+        of_task += ours  # a single task outside of the suites, whose name LeRobot does not write
+    for key in ours:
+        if key in of_task:
+            return found[key]
+    said = ", ".join(f"{suite} {number}" for suite, number in found)
+    raise InputError(f"{file} has no result that is of {task}{label} for certain; it has: {said}.")

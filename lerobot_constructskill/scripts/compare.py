@@ -12,7 +12,7 @@ from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.scripts.console import run, say
 
 if TYPE_CHECKING:
-    from lerobot_constructskill.comparison.find import Found
+    from lerobot_constructskill.comparison.read import Source
     from lerobot_constructskill.comparison.sides import Side
 
 WORSE = "worse"
@@ -33,7 +33,7 @@ class CompareConfig:
         a: the first side, the candidate.
         b: the second side, what it is compared with.
         task: the task, if neither side names one.
-        obs_type: as of lerobot-eval's --env, where neither side says it; pixels by default.
+        obs_type: as of lerobot-eval's --env, if neither side says it; pixels by default.
         episode_length: the same; the task's own by default.
         perturb: the same; none by default.
         perturb_seed: the same; 0 by default.
@@ -72,7 +72,7 @@ class CompareConfig:
 
 
 def compare(config: CompareConfig) -> str:
-    """Compare the sides and return what is printed.
+    """Compare the sides and return the text to print.
 
     Raises:
         MissingError: there is no such side.
@@ -81,26 +81,25 @@ def compare(config: CompareConfig) -> str:
         SystemExit: A is worse, and `fail_if` says that this fails.
     """
     from lerobot_constructskill.artifacts.folders import staged
-    from lerobot_constructskill.comparison import match
-    from lerobot_constructskill.comparison.find import find
+    from lerobot_constructskill.comparison.match import Asked, match
+    from lerobot_constructskill.comparison.read import find
     from lerobot_constructskill.comparison.tell import as_json, tell
 
     a, b = find(config.a), find(config.b)
     with staged(config.out) if config.out else nullcontext() as folder:
 
-        def evaluated(found: "Found", env: Mapping[str, Any], starts: Sequence[int]) -> "Side":
+        def evaluated(source: "Source", env: Mapping[str, Any], starts: Sequence[int]) -> "Side":
             from lerobot_constructskill.comparison.evaluate import evaluate
 
-            kept_in = folder and folder / ("a" if found is a else "b")
-            return evaluate(found.name, found.folders, env, starts, config.together, config.device, kept_in)
+            kept_in = folder and folder / ("a" if source is a else "b")
+            return evaluate(source, env, starts, config.together, config.device, kept_in)
 
-        asked = match.Asked(config.env, config.seed, config.episodes)
-        comparison = match.compare(a, b, asked, evaluated, config.alpha)
+        matched = match(a, b, Asked(config.env, config.seed, config.episodes), evaluated, config.alpha)
         if folder:
             folder.mkdir(exist_ok=True)
-            (folder / "comparison.json").write_text(as_json(comparison), encoding="utf-8")
-    told = tell(comparison, config.alpha)
-    if config.fail_if == comparison.judgement.verdict:
+            (folder / "comparison.json").write_text(as_json(matched), encoding="utf-8")
+    told = tell(matched, config.alpha)
+    if config.fail_if == matched.judgement.conclusion:
         say(told)
         raise SystemExit(FAILED)
     return told

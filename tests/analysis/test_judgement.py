@@ -1,4 +1,4 @@
-"""One verdict on two sides over their seeds, its interval, and what so many seeds could have shown."""
+"""One conclusion on two sides over their seeds, its interval, and what so many seeds could have shown."""
 
 from itertools import starmap
 from math import comb, inf
@@ -6,7 +6,7 @@ from math import comb, inf
 import numpy as np
 import pytest
 
-from lerobot_constructskill.analysis.stats.comparisons import Verdict
+from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.analysis.stats.judgement import judge, mean_difference, smallest_p_value
 from lerobot_constructskill.analysis.stats.power import (
     MOST,
@@ -24,17 +24,17 @@ def shares(*counts: int) -> np.ndarray:
 GOOD, BAD = shares(50, 49, 50, 48, 50, 47), shares(20, 31, 25, 28, 22, 24)
 
 
-def test_the_verdict_has_two_sides():
+def test_the_conclusion_has_two_sides():
     better, worse = judge(GOOD, BAD), judge(BAD, GOOD)
-    assert (better.verdict, worse.verdict) == (Verdict.BETTER, Verdict.WORSE)
+    assert (better.conclusion, worse.conclusion) == (Conclusion.BETTER, Conclusion.WORSE)
     assert better.difference.value == -worse.difference.value == pytest.approx(np.mean(GOOD) - np.mean(BAD))
     assert better.difference.low == pytest.approx(-worse.difference.high)
     assert better.p_value == worse.p_value < 0.05 < better.counts_p_value, "every seed of both placed at least once"
 
 
 def test_seeds_that_are_alike_need_to_be_many_before_they_are_called_so():
-    assert judge(np.ones(5), np.ones(5)).verdict is Verdict.INCONCLUSIVE
-    assert judge(np.ones(60), np.ones(60)).verdict is Verdict.ALIKE
+    assert judge(np.ones(5), np.ones(5)).conclusion is Conclusion.INCONCLUSIVE
+    assert judge(np.ones(60), np.ones(60)).conclusion is Conclusion.ALIKE
 
 
 @pytest.mark.parametrize("sizes", [(2, 2), (3, 3), (3, 4), (2, 6), (4, 4), (5, 5)])
@@ -48,7 +48,7 @@ def test_no_outcome_has_a_smaller_p_value_than_the_smallest(sizes):
 def test_one_seed_says_nothing():
     for b in (shares(50), GOOD):
         alone = judge(shares(0), b)
-        assert alone.p_value == alone.smallest_p_value == 1 and alone.verdict is Verdict.INCONCLUSIVE
+        assert alone.p_value == alone.smallest_p_value == 1 and alone.conclusion is Conclusion.INCONCLUSIVE
         assert alone.visible is alone.seeds_needed is None
 
 

@@ -9,16 +9,16 @@ import pytest
 from scipy.stats import binom, bootstrap, kendalltau
 
 from lerobot_constructskill.analysis.stats.comparisons import (
-    Verdict,
+    Conclusion,
     boschloo,
-    compare,
+    compare_counts,
     fisher,
     holm,
     probability_better,
 )
 from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
 from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, newcombe
-from lerobot_constructskill.analysis.stats.outcomes import Counts, count, seed_outcomes
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
 from lerobot_constructskill.analysis.stats.power import (
     _rejected,
     detectable_difference,
@@ -57,10 +57,10 @@ def test_fisher_gives_the_papers_four_p_values(counts, other, p_value, digits):
 def test_what_the_paper_does_not_say():
     """Spec, section 5, last paragraph."""
     assert round(fisher(BASELINE, NOISE_FREE), 2) == 0.10
-    comparison = compare(LIFTED, PAIRS)[PAIRS.index(("dinov2", "clip"))]
+    comparison = compare_counts(LIFTED, PAIRS)[PAIRS.index(("dinov2", "clip"))]
     assert round(comparison.boschloo, 3) == 0.042
     assert round(comparison.holm, 2) == 0.17
-    assert comparison.verdict is Verdict.INCONCLUSIVE
+    assert comparison.conclusion is Conclusion.INCONCLUSIVE
     assert seeds_needed(0.7, 0.5) == 102, "about 93 by the normal approximation"
     assert round(wrong_order(0.7, 0.5, 10), 2) == 0.12
     assert round(wrong_order(0.7, 0.5, 3), 2) == 0.17
@@ -122,12 +122,12 @@ def test_holm_only_raises_and_counts_what_was_not_made():
     assert holm([]) == []
 
 
-def test_verdicts():
+def test_conclusions():
     counts = {"all": Counts(30, 30), "every": Counts(30, 30), "half": Counts(15, 30), "three": Counts(3, 3)}
     pairs = [("all", "half"), ("half", "all"), ("all", "every"), ("half", "three"), ("all", "absent")]
-    comparisons = compare(counts, pairs)
-    verdicts = [Verdict.BETTER, Verdict.WORSE, Verdict.ALIKE, Verdict.INCONCLUSIVE]
-    assert [comparison.verdict for comparison in comparisons] == verdicts
+    comparisons = compare_counts(counts, pairs)
+    conclusions = [Conclusion.BETTER, Conclusion.WORSE, Conclusion.ALIKE, Conclusion.INCONCLUSIVE]
+    assert [comparison.conclusion for comparison in comparisons] == conclusions
     assert comparisons[0].holm == pytest.approx(5 * comparisons[0].boschloo)
 
 
@@ -289,7 +289,7 @@ def test_kendall_needs_errors_and_outcomes_that_differ(rng):
     )
 
 
-def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_one_is_none():
+def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_run_is_not():
     episode = {"setting": "s", "variant": "v", "error_kind": None, "error": None}
     episode |= {"heldout_mse_m2": 1e-4, "heldout_mse_m2_by_data": None}
     rows = [episode | {"training_seed": 0, "lifted": True, "placed": index > 0} for index in range(2)]
@@ -297,9 +297,9 @@ def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_on
         rows.append(episode | {"training_seed": seed, "lifted": None, "placed": None, "error_kind": kind})
     kinds = {"lifted": "boolean", "placed": "boolean", "error_kind": "string", "error": "string"}
     table = pd.DataFrame(rows).astype(kinds)
-    runs = seed_outcomes(table)
+    runs = runs_of(table)
     assert count(runs, "lifted") == count(runs, "placed") == Counts(1, 2)
     assert runs["placed_rate"].tolist() == [0.5, 0.0] and runs["episodes"].tolist() == [2, 0]
     assert runs["error_kind"].isna().tolist() == [True, False]
-    assert count(seed_outcomes(table[table["training_seed"] == 1]), "lifted") == Counts(0, 1)
-    assert seed_outcomes(table[table["training_seed"] == 2]).empty
+    assert count(runs_of(table[table["training_seed"] == 1]), "lifted") == Counts(0, 1)
+    assert runs_of(table[table["training_seed"] == 2]).empty

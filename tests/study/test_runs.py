@@ -772,7 +772,7 @@ EDITS = {
     "study/runs.py": ("runs", "FILMED_SEED = 0", "FILMED_SEED = 1"),
     "dagger/wheel.py": ("nothing", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
     "study/table.py": ("nothing", "HELDOUT = ", "HELD = "),
-    "analysis/report/wording.py": ("nothing", '"""', '"""Said otherwise. '),
+    "analysis/report/formats.py": ("nothing", '"""', '"""Said otherwise. '),
 }
 VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
 

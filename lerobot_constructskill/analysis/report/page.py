@@ -1,43 +1,43 @@
-"""A report's files: the page, its Markdown twin and the figures, from a study's folder."""
+"""Writes a study's report: report.md and report.html from one template, and the figures."""
 
 import html
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import json
+from functools import partial
 from importlib import metadata
-from itertools import count
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
+from urllib.parse import quote
 
 import draccus
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report import figures, wording
-from lerobot_constructskill.analysis.report.answer import answer, status
-from lerobot_constructskill.analysis.report.collect import collect
-from lerobot_constructskill.analysis.report.findings import Findings, SettingFindings
-from lerobot_constructskill.analysis.report.ink import Drawing, Picture, picture
-from lerobot_constructskill.analysis.report.provenance import Film, extra_facts, films, provenance
+from lerobot_constructskill.analysis.report import figures, formats
+from lerobot_constructskill.analysis.report.findings import SettingFindings
+from lerobot_constructskill.analysis.report.summarize import summarize
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wrong_order
 from lerobot_constructskill.artifacts.folders import write_text
-from lerobot_constructskill.bounds import Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
-from lerobot_constructskill.study.rows import PROVENANCE, ROWS, STUDY, check_folder, read_rows
+from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, ROWS, STUDY, check_folder, read_rows
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 MARKDOWN = "\\`*_[]|"
-"""Characters that a backslash makes plain in Markdown."""
+"""Characters that Markdown needs a backslash before."""
 
-WORDS = (
-    *(wording.chance, wording.p_value, wording.percent, wording.rare, wording.share_range, wording.signed),
-    *(wording.points, wording.points_range, wording.mean_episodes, wording.episodes_range, wording.error_range),
-    *(plural, wording.seeds, wording.seed_spans),
-)
-"""What templates may call as filters."""
+COLUMNS = {
+    "dataset_sha256": "Data set",
+    "environment_sha256": "Environment",
+    "weights_sha256": "Weights",
+    "backend": "Back end",
+}
+"""Columns of the rows in the section on provenance."""
+
+SHOWN = 4
+"""Number of different values of a column that are listed; more are counted."""
 
 
 class _Study(TypedDict):
@@ -48,92 +48,89 @@ class _Study(TypedDict):
 STUDY_FILE = Yaml("a study's file", _Study)
 
 
-@dataclass(frozen=True)
-class Heading:
-    """What a report reads of a study's file: it takes everything else from the rows."""
-
-    name: Text
-    analysis: Analysis = field(default_factory=Analysis)
-
-    def __post_init__(self):
-        check(self)
-
-
-@dataclass(frozen=True, eq=False)
-class Section:
-    """One setting of the page."""
-
-    setting: SettingFindings
-    paragraph: str
-    pictures: dict[str, Picture]
-    films: list[Film]
-
-
 def write_report(root: Path) -> Path:
     """Write report.html, report.md and figures/ into a study's folder and return the page.
 
     Raises:
-        MissingError: study.yaml or rows.parquet is not there.
+        MissingError: study.yaml or rows.parquet is missing.
         InputError: one of them cannot be read, or they do not belong together.
     """
-    heading, rows = read_study(root)
-    findings = collect(heading.analysis, rows)
-    (root / "figures").mkdir(exist_ok=True)
+    name, analysis, rows = read_study(root)
+    findings = summarize(analysis, rows)
+    figures.write_figures(findings, root / "figures")
     context = {
-        "name": heading.name,
+        "name": name,
         "study": read_text(root / STUDY),
         "findings": findings,
-        "status": status(findings),
-        "sections": _sections(root, findings, rows),
-        "sweeps": picture(figures.sweep_figure(findings), root / "figures") if findings.sweeps else None,
-        "power": picture(figures.detectable_figure(findings), root / "figures"),
+        "films": partial(films, root, rows),
         "facts": [*provenance(rows), *extra_facts(root / PROVENANCE)],
         "version": metadata.version("lerobot_env_constructskill"),
     }
-    for file, environment in (("report.md", _environment(finalize=_escape_markdown)), ("report.html", _environment())):
-        write_text(root / file, environment.get_template(file).render(numbers=_numbers(), **context))
+    for form, finalize in {"md": _escape_markdown, "html": None}.items():
+        page = _environment(finalize).get_template("report.jinja").render(form=f"{form}.jinja", **context)
+        write_text(root / f"report.{form}", page)
     return root / "report.html"
 
 
-def read_study(root: Path) -> tuple[Heading, pd.DataFrame]:
-    """Read what a report takes of a study's file, and its rows. Raises as `write_report` does."""
+def read_study(root: Path) -> tuple[str, Analysis, pd.DataFrame]:
+    """Read a study's name, its analysis section and its rows. Raises as `write_report` does."""
     check_folder(root)
-    return _read_heading(root / STUDY), read_rows(root / ROWS)
-
-
-def _read_heading(path: Path) -> Heading:
-    study = STUDY_FILE.read(path)
-    known = {key: study[key] for key in ("name", "analysis") if study.get(key) is not None}
+    study = STUDY_FILE.read(root / STUDY)
     try:
-        return draccus.decode(Heading, known)
+        analysis = draccus.decode(Analysis, study.get("analysis") or {})
     except (InputError, draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
-        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error  # draccus tells its own alone
-        raise InputError(f"'{path}' is not a study's file: {reason}") from None
+        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
+        raise InputError(f"'{root / STUDY}' is not a study's file: {reason}") from None
+    return study["name"], analysis, read_rows(root / ROWS)
 
 
-def _sections(root: Path, findings: Findings, rows: pd.DataFrame) -> list[Section]:
-    return [
-        Section(setting, paragraph, _pictures(setting, findings.episodes, root), films(root, setting, rows))
-        for setting, (_, paragraph) in zip(findings.sections, answer(findings), strict=True)
-    ]
+def films(root: Path, rows: pd.DataFrame, setting: SettingFindings) -> list[tuple[str, Markup]]:
+    """(caption, quoted path) of the first recorded episode of every variant and reference.
+
+    Videos that are missing, or lie outside of `root`, are left out.
+    """
+    rows = rows[(rows["setting"] == setting.name) & rows["video"].notna()].sort_values(["training_seed", "episode"])
+    recorded = [row for _, row in rows.iterrows() if _is_inside(root, row["video"])]
+    first = {row["variant"]: row for row in reversed(recorded)}
+    shown = [(one.label, first[one.name]) for one in setting.everything if one.name in first]
+    return [(f"{label}, {_outcome(row)}", Markup(quote(row["video"]))) for label, row in shown]
 
 
-def _pictures(setting: SettingFindings, episodes: int, root: Path) -> dict[str, Picture]:
-    drawings: dict[str, Drawing | None] = {
-        "outcomes": figures.outcome_figure(setting),
-        "seeds": figures.grid_figure(setting, episodes),
-        "error": figures.error_figure(setting, episodes),
-        "ranking": figures.ranking_figure(setting),
-    }
-    return {name: picture(drawing, root / "figures") for name, drawing in drawings.items() if drawing is not None}
+def provenance(rows: pd.DataFrame) -> list[tuple[str, str]]:
+    """(name, value) of the hashes, back ends and versions of all rows, versions last."""
+    facts = []
+    for column, title in COLUMNS.items():
+        if len(values := sorted(rows[column].dropna().unique())):
+            many = f"{len(values)} different, as in rows.parquet"
+            facts.append((title, ", ".join(values) if len(values) <= SHOWN else many))
+    versions = pd.DataFrame([json.loads(text) for text in rows["versions"].dropna().unique()])
+    return facts + [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
 
 
-def _numbers() -> Iterator[str]:
-    """Roman numerals for tables, one at every `numbers | next`."""
-    return (wording.roman(number) for number in count(1))
+def extra_facts(path: Path) -> list[tuple[str, str]]:
+    """(name, value) of the entries of an optional provenance.json.
+
+    Raises:
+        InputError: the file is not a JSON object.
+    """
+    facts = KNOWN.read(path) if path.exists() else {}
+    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
 
 
-def _environment(**options) -> Environment:
+def _is_inside(root: Path, video: str) -> bool:
+    path = (root / video.replace("\0", "")).resolve()
+    return path.is_relative_to(root.resolve()) and path.is_file()
+
+
+def _outcome(row: pd.Series) -> str:
+    """ "seed 0, episode 0: placed at step 180"."""
+    steps = {"placed": row["place_step"], "lifted": row["lift_step"]}
+    stage = next((stage for stage in steps if pd.notna(row[stage]) and row[stage]), "not lifted")
+    at = f" at step {steps[stage]}" if pd.notna(steps.get(stage)) else ""
+    return f"seed {row['training_seed']}, episode {row['episode']}: {stage}{at}{', not placed' * (stage == 'lifted')}"
+
+
+def _environment(finalize) -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
@@ -141,16 +138,15 @@ def _environment(**options) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        **options,
+        finalize=finalize,
     )
-    environment.filters |= {word.__name__: word for word in WORDS}
-    environment.filters |= {"next": next, "link": Markup}  # a link's path is quoted for URLs already
+    environment.filters |= {name: word for name, word in vars(formats).items() if callable(word)} | {"plural": plural}
     environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed, "most": MOST}
     return environment
 
 
 def _escape_markdown(value: object) -> object:
-    """Text that neither Markdown nor the HTML that Markdown lets through reads as anything but text, on one line."""
+    """Make text plain on one line, both in Markdown and in the HTML that Markdown lets through."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     text = html.escape(" ".join(value.split()), quote=False)

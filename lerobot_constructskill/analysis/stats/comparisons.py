@@ -1,4 +1,4 @@
-"""Two variants on one criterion: exact tests on seed counts, their correction, and a verdict in words."""
+"""Comparisons of two variants on one criterion: exact tests of seed counts, permutation tests of shares."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -11,13 +11,14 @@ from statsmodels.stats.multitest import multipletests
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, newcombe
 from lerobot_constructskill.analysis.stats.outcomes import Counts
+from lerobot_constructskill.analysis.stats.spread import mean_p_value, spread_p_value
 
 ALIKE_WITHIN = 0.2
-"""Two rates are called alike when the interval of their difference lies within so much of zero."""
+"""Two rates are alike if the interval of their difference lies within this distance of zero."""
 
 
-class Verdict(StrEnum):
-    """What the seeds say about a over b."""
+class Conclusion(StrEnum):
+    """What the seeds show of a against b."""
 
     BETTER = "better"
     WORSE = "worse"
@@ -25,17 +26,17 @@ class Verdict(StrEnum):
     INCONCLUSIVE = "inconclusive at this number of seeds"
 
 
-class Comparison(NamedTuple):
-    """One declared comparison.
+class CountComparison(NamedTuple):
+    """Two variants by the number of seeds that met a criterion at least once.
 
     Args:
         a, b: the variants.
-        counts_a, counts_b: their seeds that met the criterion.
-        difference: rate of a minus rate of b, Newcombe's interval at 1 - alpha.
+        counts_a, counts_b: their seed counts.
+        difference: rate of a minus rate of b, with Newcombe's interval at 1 - alpha.
         fisher, boschloo: two-tailed p-values.
-        holm: Boschloo's p-value, corrected over the declared family.
-        probability_better: that a's rate is the higher one.
-        verdict: from `holm` and `difference`.
+        holm: Boschloo's p-value, corrected over the declared comparisons.
+        probability_better: probability that a's rate is higher.
+        conclusion: from `holm` and `difference`.
     """
 
     a: str
@@ -47,7 +48,26 @@ class Comparison(NamedTuple):
     boschloo: float
     holm: float
     probability_better: float
-    verdict: Verdict
+    conclusion: Conclusion
+
+
+class RateComparison(NamedTuple):
+    """Two variants by the share of episodes that met a criterion, over seeds.
+
+    Args:
+        a, b: the variants.
+        mean: mean of a minus mean of b.
+        mean_holm: its p-value from a permutation of seeds, corrected over the declared comparisons.
+        spread: standard deviation of a minus that of b.
+        spread_holm: its p-value, likewise.
+    """
+
+    a: str
+    b: str
+    mean: float
+    mean_holm: float
+    spread: float
+    spread_holm: float
 
 
 def fisher(a: Counts, b: Counts) -> float:
@@ -65,8 +85,8 @@ def holm(p_values: Sequence[float], family: int | None = None) -> list[float]:
     """Holm's step-down correction (Holm 1979).
 
     Args:
-        p_values: of the comparisons that could be made.
-        family: how many were declared; the missing ones count as p = 1.
+        p_values: p-values of the comparisons that could be made.
+        family: number of declared comparisons; those that could not be made count as p = 1.
     """
     missing = (family or len(p_values)) - len(p_values)
     if not p_values:
@@ -82,46 +102,52 @@ def probability_better(a: Counts, b: Counts) -> float:
     return float(np.clip(quad(lambda rate: rate_a.pdf(rate) * rate_b.cdf(rate), 0, 1, points=[peak])[0], 0, 1))
 
 
-def verdict(corrected: float, difference: Estimate, alpha: float = 0.05) -> Verdict:
-    """Judge one comparison by its corrected p-value and by the interval of its difference."""
-    if corrected < alpha:
-        return Verdict.BETTER if difference.value > 0 else Verdict.WORSE
+def conclude(p_value: float, difference: Estimate, alpha: float = 0.05) -> Conclusion:
+    """Conclude from a corrected p-value and the interval of the difference."""
+    if p_value < alpha:
+        return Conclusion.BETTER if difference.value > 0 else Conclusion.WORSE
     if max(-difference.low, difference.high) <= ALIKE_WITHIN:
-        return Verdict.ALIKE
-    return Verdict.INCONCLUSIVE
+        return Conclusion.ALIKE
+    return Conclusion.INCONCLUSIVE
 
 
-def compare(counts: Mapping[str, Counts], pairs: Sequence[tuple[str, str]], alpha: float = 0.05) -> list[Comparison]:
-    """Make the declared comparisons that can be made.
+def compare_counts(
+    counts: Mapping[str, Counts], pairs: Sequence[tuple[str, str]], alpha: float = 0.05
+) -> list[CountComparison]:
+    """Make those declared comparisons whose two variants have results.
 
     Args:
-        counts: variant to counts on one criterion; variants without any result are absent.
-        pairs: every declared comparison, the family that Holm's correction covers.
-        alpha: level of the family.
+        counts: variant to seed counts on one criterion; variants without a result are absent.
+        pairs: all declared comparisons, over which Holm's correction is taken.
+        alpha: level of all of them together.
     """
-    made = [(a, b) for a, b in pairs if a in counts and b in counts]
-    p_values = [boschloo(counts[a], counts[b]) for a, b in made]
-    corrected = holm(p_values, family=len(pairs))
-    return [
-        _comparison(a, b, counts[a], counts[b], p_value, p_holm, alpha)
-        for (a, b), p_value, p_holm in zip(made, p_values, corrected, strict=True)
-    ]
+    made = [(a, b, counts[a], counts[b]) for a, b in pairs if a in counts and b in counts]
+    p_values = [boschloo(of_a, of_b) for _, _, of_a, of_b in made]
+    compared = []
+    for (a, b, of_a, of_b), p_value, corrected in zip(made, p_values, holm(p_values, len(pairs)), strict=True):
+        difference = newcombe(of_a, of_b, level=1 - alpha)
+        conclusion = conclude(corrected, difference, alpha)
+        better = probability_better(of_a, of_b)
+        p_values_of_pair = (fisher(of_a, of_b), p_value, corrected)
+        compared.append(CountComparison(a, b, of_a, of_b, difference, *p_values_of_pair, better, conclusion))
+    return compared
 
 
-def _comparison(a: str, b: str, counts_a: Counts, counts_b: Counts, p_value: float, p_holm: float, alpha: float):
-    difference = newcombe(counts_a, counts_b, level=1 - alpha)
-    return Comparison(
-        a=a,
-        b=b,
-        counts_a=counts_a,
-        counts_b=counts_b,
-        difference=difference,
-        fisher=fisher(counts_a, counts_b),
-        boschloo=p_value,
-        holm=p_holm,
-        probability_better=probability_better(counts_a, counts_b),
-        verdict=verdict(p_holm, difference, alpha),
+def compare_rates(rates: Mapping[str, np.ndarray], pairs: Sequence[tuple[str, str]]) -> list[RateComparison]:
+    """Make the same comparisons of shares of episodes.
+
+    Args:
+        rates: variant to the share in [0, 1] of each seed, (seeds,).
+        pairs: all declared comparisons.
+    """
+    made = [(a, b, rates[a], rates[b]) for a, b in pairs if a in rates and b in rates]
+    means, spreads = (
+        holm([test(of_a, of_b) for _, _, of_a, of_b in made], len(pairs)) for test in (mean_p_value, spread_p_value)
     )
+    return [
+        RateComparison(a, b, of_a.mean() - of_b.mean(), mean, of_a.std() - of_b.std(), spread)
+        for (a, b, of_a, of_b), mean, spread in zip(made, means, spreads, strict=True)
+    ]
 
 
 def _table(a: Counts, b: Counts) -> list[list[int]]:

@@ -1,4 +1,4 @@
-"""Does the offline error of a seed tell its success?"""
+"""Rank correlation of held-out error and success over training runs."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -10,17 +10,17 @@ from lerobot_constructskill.analysis.stats.intervals import Estimate
 RESAMPLES = 999
 
 FEWEST = 5
-"""Runs below which no interval is worth its name."""
+"""Fewest runs for which an interval is computed."""
 
 DRAWS_AT_ONCE = 100
 """Draws held in memory together."""
 
 Groups = Sequence[np.ndarray]
-"""Numbers of the runs of each variant."""
+"""Indices of the runs of each variant."""
 
 
 class Correlation(NamedTuple):
-    """Kendall's tau with its interval, and the p-value of none."""
+    """Kendall's tau with its interval, and the p-value of no correlation."""
 
     tau: Estimate
     p_value: float
@@ -31,22 +31,22 @@ def kendall(
 ) -> Correlation | None:
     """Kendall's tau-b of held-out error and success over the pairs of runs of one variant.
 
-    -1: the lower the error the more success, which is what a useful offline error would show. Pairs of two variants
-    are left out: that one variant is better than another in both is no sign that the error tells its own seeds apart.
+    -1 means the lower the error the more success, as a useful offline error would show. Pairs of runs of different
+    variants are left out, because differences between variants do not show that the error ranks the seeds of one.
     The p-value comes from permuting success within each variant, which keeps its level however few runs succeed. The
-    interval comes from resampling runs within each variant, and is too short where few succeed: decide by the former.
-    Closed forms leave out the many ties that success in all or no episodes makes, and `scipy.stats.kendalltau` takes
-    pairs of two variants with the others.
+    interval comes from resampling runs within each variant, and is too short where few succeed: decide by the p-value.
+    Closed forms ignore the many ties that success in all or no episodes makes, and `scipy.stats.kendalltau` includes
+    pairs of different variants.
 
     Args:
         error: held-out error of each run, (runs,); runs without one (nan) are left out.
         success: episodes that met the criterion, (runs,).
-        variant: what the run is of, (runs,).
+        variant: name of the variant of each run, (runs,).
         rng: source of the resamples.
-        level: of the interval.
+        level: level of the interval.
 
     Returns:
-        None where fewer than `FEWEST` runs are left, or in no variant both error and success differ.
+        None if fewer than `FEWEST` runs are left, or in no variant both error and success differ.
     """
     error, success = np.asarray(error, dtype=float), np.asarray(success, dtype=float)
     kept = np.isfinite(error) & np.isfinite(success)

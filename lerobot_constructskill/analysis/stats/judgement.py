@@ -1,11 +1,11 @@
-"""Two sides, each some training seeds that were evaluated on the same starts: one verdict over seeds."""
+"""Compares two sides, each of some training seeds that were evaluated on the same starts."""
 
+from dataclasses import dataclass
 from math import comb, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
-from lerobot_constructskill.analysis.stats.comparisons import Verdict, boschloo, verdict
+from lerobot_constructskill.analysis.stats.comparisons import Conclusion, boschloo, conclude
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.outcomes import Counts
 from lerobot_constructskill.analysis.stats.power import (
@@ -16,22 +16,23 @@ from lerobot_constructskill.analysis.stats.power import (
 from lerobot_constructskill.analysis.stats.spread import PERMUTATIONS, mean_p_value, mean_rate
 
 
-class Judgement(NamedTuple):
-    """What seeds say of side a over side b.
+@dataclass(frozen=True)
+class Judgement:
+    """What the seeds show of side a against side b.
 
     Args:
         counts_a, counts_b: seeds that succeeded in at least one episode.
-        mean_a, mean_b: mean over seeds of the share of episodes that succeeded, in [0, 1], with its interval.
+        mean_a, mean_b: mean over seeds of the share of successful episodes, in [0, 1], with its interval.
         difference: a's mean minus b's, with its interval.
-        p_value: of the difference of means, by a permutation of seeds; it decides the verdict.
-        smallest_p_value: below what no outcome of so many seeds can bring it.
-        counts_p_value: of the counts, by Boschloo's exact test.
-        verdict: from `p_value` and `difference`.
-        visible: the smallest difference of means that is found in 80 % of comparisons with so many seeds, where seeds
-            vary as these do; None where they do not vary, or there are too few to tell.
-        visible_at_worst: the same where each seed succeeds always or never; None where not even the largest is found.
-        seeds_needed: seeds a side with which the difference that was seen would be found so often; None where none was
-            seen or `visible` is None, infinite above `power.MOST`.
+        p_value: p-value of the difference of means, from a permutation of seeds; it decides the conclusion.
+        smallest_p_value: smallest p-value that so many seeds can give.
+        counts_p_value: p-value of the counts, from Boschloo's exact test.
+        conclusion: from `p_value` and `difference`.
+        visible: smallest difference of means that 80 % of comparisons with so many seeds find, if seeds vary as these
+            do; None if they do not vary, or a side has one seed.
+        visible_at_worst: the same if each seed succeeds always or never; None if not even the largest is found.
+        seeds_needed: seeds a side that find the observed difference with 80 % power; None if there is no difference
+            or `visible` is None, infinite above `power.MOST`.
     """
 
     counts_a: Counts
@@ -42,7 +43,7 @@ class Judgement(NamedTuple):
     p_value: float
     smallest_p_value: float
     counts_p_value: float
-    verdict: Verdict
+    conclusion: Conclusion
     visible: float | None
     visible_at_worst: float | None
     seeds_needed: float | None
@@ -52,7 +53,7 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
     """Compare two sides.
 
     Args:
-        a, b: share in [0, 1] of the episodes of each seed that succeeded, (seeds,) each, one or more.
+        a, b: share in [0, 1] of successful episodes of each seed, (seeds,) each, one or more.
         alpha: level of the test; intervals are at 1 - alpha.
     """
     counts_a, counts_b = (Counts(int(np.sum(rates > 0)), len(rates)) for rates in (a, b))
@@ -68,7 +69,7 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         p_value=p_value,
         smallest_p_value=smallest_p_value(len(a), len(b)),
         counts_p_value=boschloo(counts_a, counts_b),
-        verdict=verdict(p_value, apart, alpha),
+        conclusion=conclude(p_value, apart, alpha),
         visible=detectable_mean_difference(deviation, len(a), len(b), alpha) if deviation else None,
         visible_at_worst=detectable_difference(rate, min(len(a), len(b)), alpha),
         seeds_needed=seeds_needed_for_mean(abs(apart.value), deviation, alpha) if deviation else None,
@@ -76,22 +77,22 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
 
 
 def smallest_p_value(seeds_a: int, seeds_b: int) -> float:
-    """The p-value of a permutation of seeds where each of one side's did better than all of the other's."""
+    """The p-value of a permutation of seeds if every seed of one side did better than all of the other."""
     if min(seeds_a, seeds_b) < 2:
         return 1.0
     exact = (1 + (seeds_a == seeds_b)) / comb(seeds_a + seeds_b, seeds_a)
-    return max(exact, 1 / (PERMUTATIONS + 1))  # of random permutations, where there are too many to try all
+    return max(exact, 1 / (PERMUTATIONS + 1))  # of random permutations, if there are too many to try all
 
 
 def mean_difference(a: Estimate, b: Estimate) -> Estimate:
-    """Difference of two means from their intervals, as Newcombe (1998) takes that of two rates from Wilson's."""
+    """Difference of two means from their intervals, by Newcombe's (1998) formula for rates."""
     value = a.value - b.value
     below, above = np.hypot(a.value - a.low, b.high - b.value), np.hypot(a.high - a.value, b.value - b.low)
     return Estimate(value, max(-1.0, float(value - below)), min(1.0, float(value + above)))
 
 
 def _deviation(a: np.ndarray, b: np.ndarray) -> float:
-    """Standard deviation of a seed about the mean of its side; 0 where a side has a single seed."""
+    """Pooled standard deviation of the seeds of both sides; 0 if a side has a single seed."""
     if min(len(a), len(b)) < 2:
         return 0.0
     squares = sum(float(np.sum((rates - np.mean(rates)) ** 2)) for rates in (a, b))

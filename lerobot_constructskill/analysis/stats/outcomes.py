@@ -1,4 +1,4 @@
-"""From episodes to seeds: what a training run achieved, and how many runs met a criterion.
+"""From episodes to seeds: counts successful episodes of each run, and runs that met a criterion.
 
 The seed is the sample. Episodes are counted within their run and never pooled over runs: at a fixed position the
 episodes of a run repeat one trajectory (paper, section III).
@@ -14,11 +14,11 @@ CRITERIA = ("lifted", "placed")
 """The two success metrics of an episode, each a column of the rows."""
 
 RUN = ["setting", "variant", "training_seed"]
-"""Columns that tell one run from another."""
+"""Columns that identify a run."""
 
 
 class Counts(NamedTuple):
-    """Seeds that met a criterion, out of all seeds; failed runs are among `seeds` and not among `met`."""
+    """Seeds that met a criterion, out of all seeds; failed runs count as `seeds` and not as `met`."""
 
     met: int
     seeds: int
@@ -28,11 +28,11 @@ class Counts(NamedTuple):
         return self.met / self.seeds
 
 
-def seed_outcomes(rows: pd.DataFrame) -> pd.DataFrame:
-    """One line for every run that was made, ordered by setting, variant and seed.
+def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """One row for every run that was made, ordered by setting, variant and seed.
 
     Args:
-        rows: one line per evaluation episode, as `study.rows.read_rows` returns them.
+        rows: one row per evaluation episode, as `study.rows.read_rows` returns them.
 
     Returns:
         The columns of `RUN`; `episodes` that were run; `lifted` and `placed`, episodes that met the criterion;
@@ -55,7 +55,7 @@ def count(runs: pd.DataFrame, criterion: str) -> Counts:
     """Count the runs with at least one episode that met `criterion` (paper, Table I).
 
     Args:
-        runs: lines of `seed_outcomes`.
+        runs: rows of `runs_of`.
         criterion: one of `CRITERIA`.
     """
     return Counts(int((runs[criterion] > 0).sum()), len(runs))

@@ -1,4 +1,4 @@
-"""What a number of seeds can show: power, the smallest difference that shows, wrong orders, seeds needed."""
+"""Planning: power, the smallest detectable difference, wrong orders and the number of seeds needed."""
 
 from functools import cache
 from math import ceil, inf, sqrt
@@ -10,14 +10,14 @@ from statsmodels.stats.power import TTestIndPower, normal_sample_size_one_tail
 from statsmodels.stats.proportion import proportion_effectsize
 
 TARGET = 0.8
-"""The power that a study is planned for."""
+"""Power that a study is planned for."""
 
 MOST = 150
-"""Seeds an arm beyond which nobody asks how many exactly."""
+"""Largest number of seeds an arm that is searched for."""
 
 
 def wrong_order(rate_a: float, rate_b: float, seeds: int) -> float:
-    """Chance that of two variants of these true rates the worse one succeeds in more of `seeds` seeds each."""
+    """Chance that the worse of two variants with these true rates succeeds in more seeds, of `seeds` seeds each."""
     joint = _joint(max(rate_a, rate_b), min(rate_a, rate_b), seeds)
     return float(np.triu(joint, 1).sum())
 
@@ -25,13 +25,13 @@ def wrong_order(rate_a: float, rate_b: float, seeds: int) -> float:
 def power(rate_a: float, rate_b: float, seeds: int, alpha: float = 0.05) -> float:
     """Probability that Fisher's two-tailed test with `seeds` seeds an arm tells these rates apart, exactly.
 
-    Boschloo's has more; Fisher's is the one whose whole rejection region is quickly had.
+    Fisher's test is used because its rejection region is fast to compute; Boschloo's has more power.
     """
     return float(_joint(rate_a, rate_b, seeds)[_rejected(seeds, alpha)].sum())
 
 
 def detectable_difference(rate: float, seeds: int, alpha: float = 0.05) -> float | None:
-    """The smallest drop from `rate` that `seeds` seeds an arm show with 80 % power; None where even a drop to 0 hides.
+    """The smallest drop from `rate` that `seeds` seeds an arm show with 80 % power; None if a drop to 0 does not show.
 
     A rise from 1 - `rate` is as hard to see.
     """
@@ -42,10 +42,10 @@ def detectable_difference(rate: float, seeds: int, alpha: float = 0.05) -> float
 
 @cache
 def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> float | None:
-    """Seeds an arm with which Fisher's test tells these rates apart with 80 % power; None where they are equal.
+    """Seeds an arm with which Fisher's test tells these rates apart with 80 % power; None if they are equal.
 
     Infinite above `MOST`. The search begins at the normal approximation on arcsine-transformed rates (Cohen 1988,
-    section 6.4), which is too few, by a half near 0 and 1.
+    section 6.4), which is too low, by a half near 0 and 1.
     """
     if rate_a == rate_b:
         return None
@@ -57,12 +57,13 @@ def seeds_needed(rate_a: float, rate_b: float, alpha: float = 0.05) -> float | N
 
 
 def detectable_mean_difference(deviation: float, seeds_a: int, seeds_b: int, alpha: float = 0.05) -> float:
-    """The smallest difference of two means over seeds that is found with 80 % power, by the t-test's power.
+    """The smallest difference of two means over seeds that is found with 80 % power.
 
-    The permutation test of means has about the same. Above 1 no difference of two shares is found.
+    Computed for the t-test; the permutation test of means has about the same power. A result above 1 means that no
+    difference of two shares is found.
 
     Args:
-        deviation: standard deviation of the seeds of a side, above 0.
+        deviation: standard deviation over the seeds of a side, above 0.
         seeds_a, seeds_b: two or more each.
     """
     effect = TTestIndPower().solve_power(nobs1=seeds_a, ratio=seeds_b / seeds_a, alpha=alpha, power=TARGET)
@@ -72,7 +73,7 @@ def detectable_mean_difference(deviation: float, seeds_a: int, seeds_b: int, alp
 def seeds_needed_for_mean(difference: float, deviation: float, alpha: float = 0.05) -> float | None:
     """Seeds a side with which this difference of means is found with 80 % power; None for no difference.
 
-    Infinite above `MOST`. Arguments as of `detectable_mean_difference`.
+    Infinite above `MOST`. The deviation is that over the seeds of a side, above 0.
     """
     if round(difference, 12) == 0:
         return None
@@ -89,9 +90,9 @@ def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
 
 @cache
 def _rejected(seeds: int, alpha: float) -> np.ndarray:
-    """Which pairs of counts Fisher's test rejects, bool (seeds + 1, seeds + 1)."""
+    """The pairs of counts that Fisher's test rejects, bool (seeds + 1, seeds + 1)."""
     rejected = np.zeros((seeds + 1, seeds + 1), dtype=bool)
-    for met in range(2 * seeds + 1):  # by both arms together, which the test conditions on
+    for met in range(2 * seeds + 1):  # successes of both arms together, which the test conditions on
         a = np.arange(max(0, met - seeds), min(met, seeds) + 1)
         chances = hypergeom.pmf(a, 2 * seeds, met, seeds)
         as_unlikely = chances <= chances[:, None] * (1 + 1e-9)

@@ -1,4 +1,4 @@
-"""How much success varies from seed to seed, and whether two variants differ in that.
+"""Mean and spread of success over seeds, with permutation tests of both.
 
 The paper's closing question: do vision-language-action policies reduce the variance over seeds? Where a seed succeeds
 in all its episodes or in none, the standard deviation is sqrt(p (1 - p)) of its rate p, so a variant that seldom or
@@ -15,7 +15,7 @@ from scipy.stats import permutation_test
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 
 PERMUTATIONS = 9999
-"""Random ones, where there are more: p is then 0.0001 or more, which Holm multiplies by the number of comparisons."""
+"""Number of random permutations if there are too many to try all; then p >= 0.0001."""
 
 
 def mean_rate(rates: np.ndarray, level: float = 0.95) -> Estimate:
@@ -50,9 +50,12 @@ def _quantile(points: list[float], share: float) -> float:
 
 
 def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
-    """Permutation test, two-tailed, of the difference of a's and b's mean over seeds. Arguments of `spread_p_value`.
+    """Permutation test, two-tailed, of the difference of a's and b's mean over seeds.
 
-    For settings in which a seed succeeds in some of its episodes, where "at least once" says little.
+    It suits settings in which a seed succeeds in some of its episodes, where "at least once" says little.
+
+    Args:
+        a, b: share in [0, 1] of each seed, (seeds,) each.
     """
     return _permuted(np.mean, a, b)
 
@@ -77,8 +80,8 @@ def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray) -> float:
 
     arms = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if min(map(len, arms)) < 2:
-        return 1.0  # scipy refuses a single seed, which tells nothing of the others
-    rng = np.random.default_rng(0)  # of its own: the same p-value at every call, whatever else is tested
+        return 1.0  # scipy refuses a single seed, which says nothing of other seeds
+    rng = np.random.default_rng(0)  # a generator of its own: the same p-value at every call
     result = permutation_test(
         arms, difference, vectorized=True, alternative="greater", n_resamples=PERMUTATIONS, rng=rng
     )

@@ -1,0 +1,186 @@
+"""Computes all numbers of a report from the rows of a study and its analysis section."""
+
+import json
+from itertools import combinations, groupby
+
+import numpy as np
+import pandas as pd
+
+from lerobot_constructskill.analysis.report.findings import (
+    Findings,
+    SeedGroup,
+    SettingFindings,
+    Success,
+    Sweep,
+    VariantFindings,
+)
+from lerobot_constructskill.analysis.section import Analysis
+from lerobot_constructskill.analysis.stats.comparisons import compare_counts, compare_rates
+from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
+from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson
+from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, count, runs_of
+from lerobot_constructskill.analysis.stats.spread import mean_rate
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study.rows import NOT_RUN, VARIANT
+
+
+def summarize(analysis: Analysis, rows: pd.DataFrame) -> Findings:
+    """Compute what a report says. The same rows give the same numbers, including resampled intervals.
+
+    Args:
+        analysis: how to read the rows.
+        rows: one row per episode, from `study.rows.read_rows`.
+
+    Raises:
+        InputError: there are no rows, they contradict each other, or `analysis` names something unknown.
+    """
+    check_rows(rows)
+    planned, runs = rows.drop_duplicates(RUN), runs_of(rows)
+    of_variants = planned["role"] == VARIANT
+    variants, references = (planned.loc[chosen, "variant"].unique() for chosen in (of_variants, ~of_variants))
+    analysis.check(variants, planned["setting"].unique(), references)
+    settings = {
+        name: _setting(analysis, name, own, runs[runs["setting"] == name])
+        for name, own in planned.groupby("setting", sort=False)
+    }
+    return Findings(
+        settings=list(settings.values()),
+        sweeps=[
+            Sweep(analysis.label(name), [settings[one] for one in swept]) for name, swept in analysis.sweeps.items()
+        ],
+        alpha=analysis.alpha,
+        episodes=int(rows["episodes"].iloc[0]),
+        first_seed=int(rows["evaluation_seed"].min()),
+        planned=int(of_variants.sum()),
+        planned_references=int((~of_variants).sum()),
+        missing=int((planned["error_kind"] == NOT_RUN).sum()),
+    )
+
+
+def check_rows(rows: pd.DataFrame) -> None:
+    """Check that rows can be summarized.
+
+    Raises:
+        InputError: there are no rows, a setting has no variant, runs differ in their number of episodes, an episode
+            of a finished run lacks its outcome, or an episode stands in the rows twice.
+    """
+    if rows.empty:
+        raise InputError("The study's table has no rows.")
+    if bare := set(rows["setting"]) - set(rows.loc[rows["role"] == VARIANT, "setting"]):
+        raise InputError(f"Setting '{min(bare)}' has no variant to report.")
+    if len(lengths := sorted(rows["episodes"].unique())) > 1:
+        raise InputError(f"One table has runs of {lengths[0]} and of {lengths[1]} episodes; report them separately.")
+    finished = rows[rows["error_kind"].isna()]
+    if bare := [name for name in CRITERIA if finished[name].isna().any()]:
+        raise InputError(f"Whether an episode of a run that finished was {bare[0]} is missing in its row.")
+    twice = rows[rows.duplicated([*RUN, "episode"])]
+    if len(twice):
+        setting, variant, seed, episode = twice[[*RUN, "episode"]].iloc[0]
+        raise InputError(
+            f"Episode {episode} of {setting}/{variant}/seed_{seed} is in the rows twice; it must be counted once."
+        )
+
+
+def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame) -> SettingFindings:
+    """One setting. Only the tables follow `analysis.order`, so that another order shows the same numbers."""
+    of_variants = planned["role"] == VARIANT
+    variants, references = (_variants(analysis, planned[chosen], runs) for chosen in (of_variants, ~of_variants))
+    ordered = sorted(variants, key=lambda one: analysis.rank(one.name))
+    pairs = analysis.comparisons
+    if pairs is None:
+        pairs = [(a.name, b.name) for a, b in combinations(variants, 2) if a.seeds == b.seeds]
+    pairs = [(a, b) for a, b in pairs if {a, b} <= {one.name for one in variants}]
+    made = [one for one in variants if one.success]
+    counts, rates = {}, {}
+    for criterion in CRITERIA:
+        of = {one.name: one.success[criterion].counts for one in made}
+        counts[criterion] = compare_counts(of, pairs, analysis.alpha)
+        rates[criterion] = compare_rates({one.name: _rates(one.runs, criterion) for one in made}, pairs)
+    return SettingFindings(
+        name=name,
+        label=analysis.label(name),
+        variants=ordered,
+        references=references,
+        data_sets=_data_sets(runs),
+        groups=_groups(ordered, planned),
+        declared=len(pairs),
+        count_comparisons=counts,
+        rate_comparisons=rates,
+        correlations=_correlations(variants, ordered),
+    )
+
+
+def _variants(analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame) -> list[VariantFindings]:
+    return [
+        _variant(analysis.label(name), own, runs[runs["variant"] == name])
+        for name, own in planned.groupby("variant", sort=False)
+    ]
+
+
+def _variant(label: str, planned: pd.DataFrame, runs: pd.DataFrame) -> VariantFindings:
+    finished = runs["error_kind"].isna().any()
+    by_data = pd.DataFrame([json.loads(errors) for errors in runs["heldout_mse_m2_by_data"].dropna()])
+    return VariantFindings(
+        name=planned["variant"].iloc[0],
+        label=label,
+        demonstrations=next(iter(planned["demonstrations"].dropna()), None),
+        training_seeds=tuple(sorted(planned["training_seed"])),
+        runs=runs,
+        success={criterion: _success(runs, criterion) for criterion in CRITERIA} if finished else {},
+        error=_mean_and_range(runs["heldout_mse_m2"]),
+        errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
+    )
+
+
+def _mean_and_range(errors: pd.Series) -> Estimate | None:
+    known = errors.dropna()
+    return Estimate(float(known.mean()), float(known.min()), float(known.max())) if len(known) else None
+
+
+def _success(runs: pd.DataFrame, criterion: str) -> Success:
+    counts, rates = count(runs, criterion), _rates(runs, criterion)
+    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
+
+
+def _rates(runs: pd.DataFrame, criterion: str) -> np.ndarray:
+    return runs[f"{criterion}_rate"].to_numpy()
+
+
+def _data_sets(runs: pd.DataFrame) -> list[str]:
+    """The setting's own data set, to which `heldout_mse_m2` belongs, then the others."""
+    known = runs.dropna(subset="heldout_mse_m2_by_data")
+    errors = list(zip(known["heldout_mse_m2_by_data"].map(json.loads), known["heldout_mse_m2"], strict=True))
+    names = dict.fromkeys(name for by_data, _ in errors for name in by_data)
+    return sorted(names, key=lambda name: not any(by_data.get(name) == own for by_data, own in errors))
+
+
+def _groups(variants: list[VariantFindings], planned: pd.DataFrame) -> list[SeedGroup]:
+    """Variants by number of seeds, as in the paper: table I has the backbones, table II the ablations."""
+    first, ordered = variants[0], sorted(variants, key=lambda one: -one.seeds)
+    return [
+        SeedGroup(seeds, list(group), _first_seeds(first, planned, seeds) if first.seeds > seeds else None)
+        for seeds, group in groupby(ordered, key=lambda one: one.seeds)
+    ]
+
+
+def _first_seeds(variant: VariantFindings, planned: pd.DataFrame, seeds: int) -> VariantFindings:
+    chosen = variant.training_seeds[:seeds]
+    own = planned[(planned["variant"] == variant.name) & planned["training_seed"].isin(chosen)]
+    label = f"{variant.label}, first {f'{seeds} seeds' if seeds > 1 else 'seed'}"
+    return _variant(label, own, variant.runs[variant.runs["training_seed"].isin(chosen)])
+
+
+def _correlations(
+    variants: list[VariantFindings], ordered: list[VariantFindings]
+) -> list[tuple[str, dict[str, Correlation | None]]]:
+    def correlate(runs: pd.DataFrame) -> dict[str, Correlation | None]:
+        error, variant = runs["heldout_mse_m2"].to_numpy(), runs["variant"].to_numpy()
+        return {name: kendall(error, runs[name].to_numpy(), variant, np.random.default_rng(0)) for name in CRITERIA}
+
+    # Two variants of the same checkpoints, evaluated differently, would count a seed's error twice.
+    different = {
+        tuple(one.runs[["training_seed", "heldout_mse_m2"]].itertuples(index=False, name=None)): one
+        for one in reversed(variants)
+    }
+    within = pd.concat([one.runs for one in variants if one in different.values()])
+    return [("all, within variants", correlate(within)), *((one.label, correlate(one.runs)) for one in ordered)]
