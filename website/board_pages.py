@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from lerobot_constructskill.board.exports import TABLE
-from lerobot_constructskill.board.protocol import SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.board.site import write_board
 
 FOLDER = "board"
@@ -19,7 +19,9 @@ def files(root: Path) -> dict[str, str | bytes]:
 
 
 def page() -> str:
-    suites = "\n".join(f"- [`{name}`](../{FOLDER}/{name}.html): {', '.join(SUITES[name].settings)}" for name in SUITES)
+    suites = "\n".join(
+        f"- [`{name}`](../{FOLDER}/{name}.html): {', '.join(suite.settings)}" for name, suite in BOARD_SUITES.items()
+    )
     return (
         "# The board\n\nA page for each suite, with every entry's interval over training seeds and the outcome of "
         f"every episode:\n\n{suites}\n\n[All entries](../{FOLDER}/index.html), and every episode of them as "

@@ -8,7 +8,7 @@ import pandas as pd
 
 from lerobot_constructskill.comparison.sides import MAKER, Conditions, Outcomes, Side, merge_versions, read_versions
 from lerobot_constructskill.contract import LOOSE, SUITES
-from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, read_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import EVALUATED
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_environments, read_rows
@@ -87,12 +87,12 @@ def read_recorded(name: str, folders: Sequence[Path]) -> Side:
     )
 
 
-def _versions_of(recording: Recording) -> dict[str, str]:
+def _versions_of(recording: Episode) -> dict[str, str]:
     told = read_versions(recording.versions, backend=recording.backend)
     return {MAKER if name == "processor" else name: value for name, value in told.items()}
 
 
-def _recorded(folder: Path, recordings: list[Recording]) -> Outcomes:
+def _recorded(folder: Path, recordings: list[Episode]) -> Outcomes:
     starts = [one.evaluation_seed for one in recordings]
     if twice := [start for start in starts if starts.count(start) > 1]:
         raise InputError(
