@@ -5,8 +5,8 @@ observation. Action queues and temporal ensembling, which mix chunks of several 
 sample (diffusion, flow) draw anew for every frame, which their consistency includes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Subset
 from lerobot_constructskill.contract import GRIPPER, TRANSLATION
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.agents import PolicyAgent, observing
 
 
 @dataclass(frozen=True)
@@ -126,21 +126,10 @@ def check_actions(policy: PreTrainedPolicy, dataset: LeRobotDataset) -> None:
         )
 
 
-@contextmanager
-def shown(dataset: LeRobotDataset) -> Iterator[None]:
-    """Refuse a policy that asks for an observation, by the name that its own processors give, which is not there.
-
-    Raises:
-        InputError: inside the block it looks for one that the data set does not have.
-    """
-    try:
-        yield
-    except KeyError as error:
-        key = str(error.args[0])
-        if not key.startswith("observation.") or key in dataset.meta.features:
-            raise
-        has = ", ".join(name for name in dataset.meta.features if name.startswith("observation."))
-        raise InputError(f"The policy reads {key}; '{dataset.repo_id}' has {has}.") from None
+def observing_frames(dataset: LeRobotDataset) -> AbstractContextManager[None]:
+    """Context in which a policy that reads an observation which a data set lacks is an InputError, not a KeyError."""
+    has = ", ".join(name for name in dataset.meta.features if name.startswith("observation."))
+    return observing(dataset.meta.features, f"'{dataset.repo_id}' has {has}")
 
 
 def predict(
