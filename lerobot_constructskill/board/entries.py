@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,8 +63,8 @@ class Entry:
 
     @property
     def is_ranked(self) -> bool:
-        enough = len(self.said.training_seeds) >= RANKED_FROM
-        return not self.is_reference and enough and self.level != CLAIMED and self.said.is_replayable
+        is_checked = self.level != CLAIMED and self.said.is_replayable
+        return is_checked and not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
 
     @property
     def missing_seeds(self) -> int:
@@ -76,15 +77,13 @@ class Entry:
         return {name: self._standing(name) for name in self.said.settings}
 
     def _standing(self, setting: str) -> Standing:
-        claims = {seed: [] for seed in sorted(self.said.training_seeds)}
-        for claim in sorted(self.submission.claims, key=lambda claim: claim.key):
-            if claim.setting == setting:
-                claims[claim.training_seed].append(claim)
+        there = sorted((one for one in self.submission.claims if one.setting == setting), key=lambda one: one.key)
+        claims = {seed: list(own) for seed, own in groupby(there, key=lambda one: one.training_seed)}
         placed, lifted = (
             mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]))
             for of in ("placed", "lifted")
         )
-        return Standing(claims, placed, lifted, sum(one.error is not None for own in claims.values() for one in own))
+        return Standing(claims, placed, lifted, errors=sum(one.error is not None for one in there))
 
 
 class Read(NamedTuple):

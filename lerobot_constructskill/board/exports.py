@@ -52,18 +52,19 @@ def eval_info(entry: Entry, seed: int) -> dict[str, Any]:
 
 
 def _metrics(claims: list[Claim]) -> dict[str, list]:
+    rewards = [_rewards(claim) for claim in claims]
     return {
-        "sum_rewards": [sum(_rewards(claim)) for claim in claims],
-        "max_rewards": [max(_rewards(claim)) for claim in claims],
+        "sum_rewards": [sum(own) for own in rewards],
+        "max_rewards": [max(own, default=0.0) for own in rewards],
         "successes": [claim.placed for claim in claims],
         "video_paths": [],
     }
 
 
 def _rewards(claim: Claim) -> list[float]:
-    """The reward of every step: that of the stage reached by then; one 0 for an episode that failed with an error."""
+    """The reward of every step: that of the stage reached by then."""
     lifted, placed = (inf if step is None else step for step in (claim.lift_step, claim.place_step))
-    steps = range(1, max(claim.steps, 1) + 1)
+    steps = range(1, claim.steps + 1)
     return [REWARD_PLACED if step >= placed else REWARD_LIFTED if step >= lifted else 0.0 for step in steps]
 
 

@@ -31,11 +31,8 @@ def write_films(entries: Sequence[Entry], out: Path) -> None:
         OSError: a worker died, or there is nothing to render with.
     """
     films = [film for entry in entries for name in entry.standings for film in _films(entry, name).items()]
-    missing = [(claim, out / path) for path, claim in films if not (out / path).exists()]
-    if not missing:
-        return
     with open_workers() as submit:
-        running = [submit(_film, *job) for job in missing]
+        running = [submit(_film, claim, out / path) for path, claim in films if not (out / path).exists()]
         for future in Progress(running, "filming", unit="episode"):
             future.result()
 

@@ -4,12 +4,10 @@ import os
 import random
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from itertools import batched, groupby
 from typing import Any
 
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
-from lerobot_constructskill.artifacts.processor import make
 from lerobot_constructskill.board.protocol import PHYSICS
 from lerobot_constructskill.board.submission import Claim, Submission
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -29,27 +27,15 @@ OTHER_MAKE = (
 )
 
 
-@dataclass(frozen=True)
-class Replay:
-    """A replay in which every episode ended as claimed.
-
-    Args:
-        replayed: episodes that were executed.
-        failed: episodes that have an error in place of actions: there is nothing to execute, and they count as failed.
-        steps: that were executed.
-    """
-
-    replayed: int
-    failed: int
-    steps: int
-
-
-def replay_submission(submission: Submission, workers: int | None = None, sample: int | None = None) -> Replay:
+def replay_submission(submission: Submission, workers: int | None = None, sample: int | None = None) -> list[Claim]:
     """Execute every action of a submission, or those of a sample of its episodes.
 
     Args:
         workers: processes; one per core by default.
         sample: so many episodes, drawn by the operating system's randomness; all by default.
+
+    Returns:
+        The episodes that were executed, without those that failed with an error and have no actions.
 
     Raises:
         InputError: an episode does not end as claimed, or it was made with another physics than is replayed.
@@ -61,19 +47,17 @@ def replay_submission(submission: Submission, workers: int | None = None, sample
             f"The submission was made with '{declaration.backend}'; only {PHYSICS} can be replayed, and results of "
             "another backend stay claimed and have no rank."
         )
-    acted = [claim for claim in submission.claims if claim.error is None]
-    chosen = acted if sample is None else random.SystemRandom().sample(acted, min(sample, len(acted)))
-    differences = _execute(sorted(chosen, key=lambda claim: claim.key), workers)
-    if differences:
-        others = _other_versions(declaration.versions)
-        told = " ".join(f"{one}{others}." for one in differences[:SHOWN])
+    claims = [claim for claim in submission.claims if claim.error is None]
+    if sample is not None:
+        claims = random.SystemRandom().sample(claims, min(sample, len(claims)))
+    if differences := _execute(sorted(claims, key=lambda claim: claim.key), workers):
         more = len(differences) - SHOWN
         raise InputError(
-            f"{len(differences)} of {len(chosen)} replayed episodes are not as claimed: {told}"
-            f"{f' And {more} more.' if more > 0 else ''}"
-            f"{'' if declaration.versions.get('processor') == make() else OTHER_MAKE}"
+            f"{len(differences)} of {len(claims)} replayed episodes are not as claimed: "
+            f"{'. '.join(differences[:SHOWN])}.{f' And {more} more.' if more > 0 else ''} "
+            f"{_reason(declaration.versions)}"
         )
-    return Replay(len(chosen), len(submission.claims) - len(acted), sum(claim.steps for claim in chosen))
+    return claims
 
 
 def _execute(claims: Sequence[Claim], workers: int | None) -> list[str]:
@@ -92,14 +76,18 @@ def _execute(claims: Sequence[Claim], workers: int | None) -> list[str]:
     return found
 
 
-def _other_versions(there: dict[str, str]) -> str:
-    """Names what may be the reason for a difference that is nobody's fault."""
-    told = [
-        f"{name} {there.get(name, 'unknown')[:40]!a} there, {ours} here"
-        for name, ours in deciding().items()
-        if there.get(name) != ours
+def _reason(there: dict[str, str]) -> str:
+    """A sentence about versions that differ, which may be the reason for a difference that is nobody's fault."""
+    here = deciding()
+    others = [
+        f"{name} {there.get(name, 'unknown')[:40]!a} there, {here[name]} here"
+        for name in here
+        if there.get(name) != here[name]
     ]
-    return f" (made with others: {'; '.join(told)})" if told else " (with the same versions and make of processor)"
+    if not others:
+        return "It was made with the same versions and make of processor."
+    other_make = OTHER_MAKE if there.get("processor") != here["processor"] else ""
+    return f"It was made with others: {'; '.join(others)}.{other_make}"
 
 
 def open_workers(workers: int | None = None) -> AbstractContextManager[Submit]:

@@ -1,8 +1,5 @@
 """The level re-run: the checkpoints are evaluated again, on starts that nobody could know before."""
 
-from collections import defaultdict
-from dataclasses import dataclass
-
 import numpy as np
 import yaml
 
@@ -12,30 +9,6 @@ from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, f
 from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
-
-
-@dataclass(frozen=True)
-class Rates:
-    """Share of episodes that placed in one setting: as submitted, and run again.
-
-    Args:
-        p_value: of a permutation test, two-tailed and corrected by Holm over the settings. Its unit is the start: the
-            checkpoints are the same in both, so starts of one kind could be dealt to the two at random. Where there is
-            one start alone, it is the training seed.
-    """
-
-    setting: str
-    submitted: float
-    again: float
-    p_value: float
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether fresh starts went worse than chance explains."""
-        return self.again < self.submitted and self.p_value < RERUN_ALPHA
-
-    def __str__(self) -> str:
-        return f"{self.setting} {self.submitted:.0%} submitted, {self.again:.0%} run anew"
 
 
 def instructions(submission: Submission, value: str) -> str:
@@ -69,15 +42,22 @@ def instructions(submission: Submission, value: str) -> str:
     return "\n".join(lines + files)
 
 
-def compare_rerun(submission: Submission, again: Submission, value: str) -> list[Rates]:
-    """Compare a re-run with its submission, setting by setting.
+def compare_rerun(submission: Submission, again: Submission, value: str) -> dict[str, tuple[float, float]]:
+    """Compare a re-run with its submission.
+
+    A permutation test, two-tailed and corrected by Holm over the settings, decides whether fresh starts went worse.
+    Its unit is the start: the checkpoints are the same in both, so starts of one kind could be dealt to the two at
+    random. Where there is one start alone, the unit is the training seed.
 
     Args:
         value: the public random number, as of `protocol.fresh_start`.
 
+    Returns:
+        For each setting the share of episodes that placed, as submitted and run again.
+
     Raises:
-        InputError: it is a reference, the re-run is not from the starts or not of the training seeds that it should
-            be, or they are too few for the test to refuse anything.
+        InputError: fresh starts went worse than chance explains, or are too few to show that; it is a reference, or
+            the re-run is not from the starts or not of the training seeds that it should be.
     """
     _check_policy(submission)
     first = fresh_start(submission.sha256, value)
@@ -87,21 +67,24 @@ def compare_rerun(submission: Submission, again: Submission, value: str) -> list
         raise InputError("The re-run does not have the submission's training seeds.")
     names = sorted(submission.declaration.settings)
     pairs = [(_placed(submission, name), _placed(again, name)) for name in names]
-    could_be = holm([mean_p_value(np.ones(len(own)), np.zeros(len(fresh))) for own, fresh in pairs])
+    could_be = holm([mean_p_value(np.ones_like(own), np.zeros_like(fresh)) for own, fresh in pairs])
     if min(could_be) >= RERUN_ALPHA:
         raise InputError(
             "Too few starts to confirm anything: if all placed as submitted and none anew, p would be "
             f"{min(could_be):.2g}, not below {RERUN_ALPHA}."
         )
-    p_values = holm([mean_p_value(*pair) for pair in pairs])
-    rows = zip(names, pairs, p_values, strict=True)
-    return [Rates(name, own.mean(), fresh.mean(), p) for name, (own, fresh), p in rows]
+    rates = {name: (own.mean(), fresh.mean()) for name, (own, fresh) in zip(names, pairs, strict=True)}
+    p_values = dict(zip(names, holm([mean_p_value(*pair) for pair in pairs]), strict=True))
+    worse = {name: own for name, own in rates.items() if own[1] < own[0] and p_values[name] < RERUN_ALPHA}
+    if worse:
+        told = "; ".join(f"{describe({name: own})} (p = {p_values[name]:.2g})" for name, own in worse.items())
+        raise InputError(f"The re-run does not confirm it: {told}.")
+    return rates
 
 
-def confirm(rates: list[Rates]) -> None:
-    """Raise InputError where fresh starts went worse than chance explains."""
-    if worse := [f"{one} (p = {one.p_value:.2g})" for one in rates if one.is_worse]:
-        raise InputError(f"The re-run does not confirm it: {'; '.join(worse)}.")
+def describe(rates: dict[str, tuple[float, float]]) -> str:
+    """The rates of `compare_rerun` as text."""
+    return "; ".join(f"{name} {own:.0%} submitted, {again:.0%} run anew" for name, (own, again) in rates.items())
 
 
 def _check_policy(submission: Submission) -> None:
@@ -118,9 +101,7 @@ def _placed(submission: Submission, setting: str) -> np.ndarray:
 
     Of a setting with one start: which training seeds placed, (training seeds,).
     """
-    unit = "training_seed" if submission.declaration.settings[setting].episodes == 1 else "evaluation_seed"
-    by_unit = defaultdict(list)
-    for claim in submission.claims:
-        if claim.setting == setting:
-            by_unit[getattr(claim, unit)].append(claim.placed)
-    return np.array([np.mean(of) for of in by_unit.values()])
+    claims = sorted((one for one in submission.claims if one.setting == setting), key=lambda one: one.key)
+    placed = np.array([claim.placed for claim in claims], dtype=float)  # by training seed, then by start
+    placed = placed.reshape(len(submission.declaration.training_seeds), -1)
+    return placed[:, 0] if placed.shape[1] == 1 else placed.mean(axis=0)

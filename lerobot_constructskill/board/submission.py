@@ -55,12 +55,7 @@ class Claim(Episode):
     @property
     def label(self) -> str:
         """How sentences call it."""
-        return label_of(*self.key)
-
-
-def label_of(setting: str, training_seed: int, start: int) -> str:
-    """How sentences call an episode."""
-    return f"{setting}, training seed {training_seed}, start {start}"
+        return f"{self.setting}, training seed {self.training_seed}, start {self.evaluation_seed}"
 
 
 COLUMNS = ("evaluation_seed", *OUTCOME, "setting", "training_seed", "error", "actions")
@@ -164,8 +159,8 @@ def _check_keys(declaration: Declaration, keys: list[tuple[str, int, int]]) -> N
         ("is missing", expected - found.keys()),
     ):
         if wrong:
-            setting, *seeds = min(wrong)
-            raise InputError(f"{label_of(ascii(setting[:60]), *seeds)} {kind}.")
+            setting, seed, start = min(wrong)
+            raise InputError(f"{setting[:60]!a}, training seed {seed}, start {start} {kind}.")
 
 
 def _check(claim: Claim) -> None:

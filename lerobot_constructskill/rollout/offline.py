@@ -153,15 +153,12 @@ def predict(
     rows = [dataset.meta.episodes[episode] for episode in episodes]
     spans = [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
     predictions = []
-    with Progress(total=sum(map(len, spans)), desc=policy.name, unit="frame", leave=False) as bar:
-        for span in spans:
-            policy.reset()
-            batches = []
-            for batch in DataLoader(Subset(dataset, span), batch_size):
-                batches.append(ask(policy, preprocess, postprocess, batch))
-                bar.update(len(batch["action"]))
-            labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
-            predictions.append(Predictions(labels, chunks))
+    for span in Progress(spans, policy.name, unit="demo", leave=False):
+        policy.reset()
+        batches = DataLoader(Subset(dataset, span), batch_size)
+        asked = [ask(policy, preprocess, postprocess, batch) for batch in batches]
+        labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*asked, strict=True))
+        predictions.append(Predictions(labels, chunks))
     return predictions
 
 
@@ -228,12 +225,7 @@ def policy_errors(
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
         if frame["phase"] in phases:
-            wanted = frame["action"] if labels == "advice" else _clean_action(frame)
-            errors.append((action - wanted.numpy())[:3])
+            clean = frame["dart.executed_action"][:3] - frame["dart.noise"]
+            wanted = frame["action"][:3] if labels == "advice" else clean
+            errors.append(action[:3] - wanted.numpy())
     return np.array(errors, dtype=np.float64).reshape(-1, 3)
-
-
-def _clean_action(frame: dict) -> torch.Tensor:
-    clean = frame["dart.executed_action"].clone()
-    clean[:3] -= frame["dart.noise"]
-    return clean

@@ -41,32 +41,29 @@ def verify(config: VerifyConfig) -> str:
     """
     from lerobot_constructskill.board.protocol import REPLAYED, RERUN
     from lerobot_constructskill.board.replay import replay_submission
-    from lerobot_constructskill.board.rerun import compare_rerun, confirm, instructions
+    from lerobot_constructskill.board.rerun import compare_rerun, describe, instructions
     from lerobot_constructskill.board.submission import read_submission
     from lerobot_constructskill.board.verification import record_verification
 
     submission = read_submission(config.root)
     if config.value is not None and config.rerun is None:
         return instructions(submission, config.value)
-    rates = []
-    if config.rerun is not None:  # compared before either is replayed, which takes minutes
+    level, facts, told = REPLAYED, None, ""
+    if config.rerun is not None:  # compared before anything is replayed, which takes minutes
         again = read_submission(config.rerun)
         rates = compare_rerun(submission, again, config.value)
-    done = replay_submission(submission, config.workers, config.sample)
-    told = (
-        f"{config.root} holds: {done.replayed} of {len(submission.claims)} episodes replayed "
-        f"({plural(done.steps, 'step')}), each ended as claimed; {done.failed} failed with an error."
-    )
-    level, facts = REPLAYED, None
-    if rates:
         replay_submission(again, config.workers, config.sample)
-        confirm(rates)
-        told = f"{told} Placed, on its own starts and on fresh ones: {'; '.join(map(str, rates))}."
-        level = RERUN
-        facts = {"value": config.value, "settings": {one.setting: [one.submitted, one.again] for one in rates}}
+        level, facts = RERUN, {"value": config.value, "settings": {name: list(own) for name, own in rates.items()}}
+        told = f" Placed, on its own starts and on fresh ones: {describe(rates)}."
+    replayed = replay_submission(submission, config.workers, config.sample)
     if config.record is not None:
         record_verification(config.record / f"{config.root.resolve().name}.json", submission.sha256, level, facts)
-    return told
+    failed = sum(claim.error is not None for claim in submission.claims)
+    return (
+        f"{config.root} holds: {len(replayed)} of {len(submission.claims)} episodes replayed "
+        f"({plural(sum(claim.steps for claim in replayed), 'step')}), each ended as claimed; {failed} failed with an "
+        f"error.{told}"
+    )
 
 
 def main() -> None:
