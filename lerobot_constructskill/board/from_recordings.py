@@ -82,10 +82,9 @@ def _alike(
     root: Path, ran: Iterable[str], settings: Mapping[str, BoardSetting], chosen: Sequence[str] | None
 ) -> list[str]:
     """Those settings of a study that a variant `ran` in and that evaluate as one of `settings` does."""
-    names = ("task", "episode_length", "perturb", "perturb_seed")
     places = {
-        setting: where(**{name: env[name] for name in names if name in env})
-        for setting, env in read_environments(root).items()
+        name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
+        for name, env in read_environments(root).items()
     }
     if unknown := [name for name in chosen or () if name not in places]:
         raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(places)}.")

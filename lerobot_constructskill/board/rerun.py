@@ -1,5 +1,7 @@
 """The level re-run: the checkpoints are evaluated again, on starts that nobody could know before."""
 
+from dataclasses import asdict
+
 import numpy as np
 import yaml
 
@@ -23,23 +25,23 @@ def instructions(submission: Submission, value: str) -> str:
     _check_policy(submission)
     declaration = submission.declaration
     first = fresh_start(submission.sha256, value)
-    lines = [f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:"]
-    files = []
-    for name, setting in fresh_settings(declaration.settings, first).items():
-        perturb = {"perturb": setting.perturb, "perturb_seed": setting.perturb_seed}
-        perturb = perturb if any(perturb.values()) else {}
-        flags = "".join(f" --env.{field}='{drawn}'" for field, drawn in perturb.items())
-        lines.append(
-            "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
-            f"--env.task={setting.task} --env.obs_type={declaration.about.observes} "
-            f"--env.episode_length={setting.episode_length}{flags} --eval.n_episodes={setting.episodes} "
-            f"--eval.batch_size=1 --seed={first}"
-        )
-        shown = {"task": setting.task, "episodes": setting.episodes, "episode_length": setting.episode_length}
-        shown |= {"first_start": first} | perturb
-        files.append(yaml.safe_dump({name: shown}, default_flow_style=None, sort_keys=False, width=300).strip())
-    lines.append("Then make a submission of it with these settings, and verify it with --value and --rerun:")
-    return "\n".join(lines + files)
+    settings = fresh_settings(declaration.settings, first)
+    flags = [" ".join(f"--env.{name}='{one}'" for name, one in own.environment.items()) for own in settings.values()]
+    commands = [
+        "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
+        f"{env} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} --eval.batch_size=1 "
+        f"--seed={first}"
+        for env, setting in zip(flags, settings.values(), strict=True)
+    ]
+    plain = {name: asdict(setting) for name, setting in settings.items()}
+    return "\n".join(
+        [
+            f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:",
+            *commands,
+            "Then make a submission of it with these settings, and verify it with --value and --rerun:",
+            yaml.safe_dump(plain, default_flow_style=None, sort_keys=False, width=300).strip(),
+        ]
+    )
 
 
 def compare_rerun(submission: Submission, again: Submission, value: str) -> dict[str, tuple[float, float]]:

@@ -1,4 +1,4 @@
-"""What a policy predicts on held-out demonstrations: how far its actions are from theirs, and how steady its chunks.
+"""Errors of a policy's predictions on held-out demonstrations, and the consistency of its chunks.
 
 Every policy is asked the same of every frame, as it was asked in training: a fresh chunk from that frame's
 observation. Action queues and temporal ensembling, which mix chunks of several frames, play no part. Policies that
@@ -166,10 +166,10 @@ def predict(
 def ask(
     policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Labels (B, A) of a batch, and chunks (B, C, A) that a policy predicts; C is 1 where it predicts none.
+    """Labels (B, A) of a batch, and the chunks (B, C, A) that a policy predicts; C is 1 for a policy without chunks.
 
     Raises:
-        InputError: it makes its chunks from a queue of past observations.
+        InputError: the policy makes its chunks from a queue of past observations.
     """
     seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
     seen = preprocess(seen | {name: batch[name] for name in ("task", "index")})
@@ -189,9 +189,9 @@ def ask(
 
 
 def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
-    """The data set with as many observations a frame as the policy was trained on.
+    """Open the data set again with as many observations in a frame as the policy was trained on.
 
-    A policy class whose policies read what was computed of images takes part by a method `read_features`.
+    A policy class that reads features in place of images has a method `read_features`, which is called here.
 
     Raises:
         InputError: another encoder than the policy's made the data set's features.

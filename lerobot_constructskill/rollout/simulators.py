@@ -29,7 +29,15 @@ DIED = "A simulator's process died; if there was not enough memory, run fewer at
 
 @dataclass(frozen=True)
 class Step:
-    """What an environment returned from `reset` or `step`, with its privileged state and its proprioception."""
+    """What an environment returned from `reset` or `step`.
+
+    Args:
+        seen: the observation.
+        sim: privileged state, `contract.SIM_STATE` name to float32 array.
+        done: whether the episode is over.
+        info: as of `ConstructSkillEnv.step`.
+        agent_state: proprioception, (8,) float32.
+    """
 
     seen: dict[str, Any]
     sim: dict[str, np.ndarray]
@@ -42,8 +50,9 @@ class Step:
 class Simulators:
     """Environments, spread over worker processes; environment i lives in worker i % workers.
 
-    Every method takes a mapping from an environment's number and answers with one, in which an environment that raised
-    has its exception. They raise `OSError` where a worker died, out of memory for instance.
+    `reset` and `step` take a value for each environment by number, and return what each returned; in place of it
+    stands the exception of an environment that raised. They raise `OSError` where a worker died, for instance because
+    memory ran out.
     """
 
     def __init__(self, workers: Sequence[Executor]):
