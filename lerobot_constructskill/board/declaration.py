@@ -1,8 +1,6 @@
 """submission.yaml: what the author of a submission says of the policy, and where it was evaluated."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Annotated
 
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
@@ -142,11 +140,15 @@ class Declaration:
             for setting in self.settings.values()
         )
 
-    def keys(self) -> Iterator[tuple[str, int, int]]:
+    @property
+    def keys(self) -> set[tuple[str, int, int]]:
         """Setting, training seed and evaluation seed of every episode that is to be there."""
-        for name, setting in self.settings.items():
-            for seed, start in product(self.training_seeds, setting.starts):
-                yield name, seed, start
+        return {
+            (name, seed, start)
+            for name, setting in self.settings.items()
+            for seed in self.training_seeds
+            for start in setting.starts
+        }
 
 
 ABOUT = Yaml("what is said of a policy", About)

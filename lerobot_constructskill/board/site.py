@@ -48,8 +48,7 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
         write_text(out / name, text)
     write_exports(entries, out, day, dataset_id)
     if refused:
-        more = f" And {len(refused) - 1} more." if len(refused) > 1 else ""
-        raise InputError(f"The board in {out} is without what cannot be read. {refused[0]}{more}")
+        raise InputError(f"The board in {out} is without what cannot be read. {' '.join(refused)}")
     return [out / name for name in pages]
 
 

@@ -152,7 +152,7 @@ def _read_claims(path: Path, declaration: Declaration) -> list[Claim]:
 
 def _check_keys(declaration: Declaration, keys: list[tuple[str, int, int]]) -> None:
     """Every declared episode is there once, and none that is not declared."""
-    expected, found = set(declaration.keys()), Counter(keys)
+    expected, found = declaration.keys, Counter(keys)
     for kind, wrong in (
         ("is there twice", [key for key, count in found.items() if count > 1]),
         ("is not declared", found.keys() - expected),

@@ -45,7 +45,7 @@ def record_verification(path: Path, submission: str, level: str, rerun: dict[str
 
     What else is known of the submission stays: the first date, other machines, a re-run.
     """
-    versions = {name: value for name, value in deciding().items() if name != "processor"}
+    versions = {name: value for name, value in deciding().items() if name != "processor"}  # the make is no version
     facts = {"submission": submission, "level": level, "versions": versions} | ({"rerun": rerun} if rerun else {})
     lock = path.with_name(f".{path.name}.lock")
     with locked(lock):  # of two at once the second adds to what the first has written
@@ -54,6 +54,6 @@ def record_verification(path: Path, submission: str, level: str, rerun: dict[str
             facts |= {name: before[name] for name in ("level", "rerun") if name in before}
         earlier = before["machines"] if before.get("versions") == versions else []
         first = {"date": before.get("date", datetime.now(UTC).date().isoformat())}
-        machines = {"machines": list(dict.fromkeys([*earlier, processor()]))}
-        write_text(path, json.dumps(first | facts | machines, indent=2) + "\n")
+        facts = first | facts | {"machines": list(dict.fromkeys([*earlier, processor()]))}
+        write_text(path, json.dumps(facts, indent=2) + "\n")
         lock.unlink()

@@ -1,6 +1,6 @@
-"""The rows of a study: one per evaluation episode, in one tidy parquet table. No torch, no simulator.
+"""The rows of a study: one per evaluation episode, in one tidy Parquet table. Imports neither torch nor a simulator.
 
-A run keeps its own episodes as `EpisodeRow`; the table of a study says of each which setting and variant it is, and
+A run keeps its episodes as `EpisodeRow`. The table of a study holds `Row`, which adds the setting and the variant, and
 has one row for every run that failed or has not been made.
 """
 
@@ -21,10 +21,10 @@ from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.files import Json, Yaml
 
 STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
-"""Files in a study's folder: the study as it was read, its rows, and what is known of how they were made."""
+"""Files in a study's folder: the study as it was read, its rows, and facts about how they were made."""
 
 VARIANT, REFERENCE, SIGHTLESS = "variant", "reference", "sightless"
-"""Roles: what is compared; a floor or ceiling; one of those that does not look at the scene."""
+"""Roles: what is compared; a floor or ceiling; a floor or ceiling that does not look at the scene."""
 
 NOT_RUN = "not_run"
 """`error_kind` of a run that has not been made; any other kind is that of an exception (`errors.kind`)."""
@@ -60,7 +60,7 @@ SETTINGS = Yaml("a study's file", _Settings)
 
 
 def read_environments(root: Path) -> dict[str, dict[str, Any]]:
-    """How a study's folder says that each of its settings is evaluated: fields of `--env.type=constructskill`.
+    """Read where each setting of a study's folder is evaluated: fields of `--env.type=constructskill`, by setting.
 
     Raises:
         InputError: its file is not a study's.
@@ -69,7 +69,7 @@ def read_environments(root: Path) -> dict[str, dict[str, Any]]:
 
 
 def check_folder(root: Path) -> None:
-    """Refuse what is not the folder of a study.
+    """Refuse a folder that is not a study's.
 
     Raises:
         MissingError: its file or its rows are not there.
