@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from lerobot_constructskill.board.protocol import SUITES, Setting
+from lerobot_constructskill.board.protocol import BOARD_SUITES, BoardSetting
 from lerobot_constructskill.contract import DEMO_SEED_START, Task, get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
@@ -60,18 +60,12 @@ def act(env: ConstructSkillEnv, agent: Agent, seed: int) -> list[np.ndarray]:
     return actions
 
 
-def run(setting: Setting, reference: str, starts: tuple[int, ...], folder: Path) -> None:
+def run(setting: BoardSetting, reference: str, starts: tuple[int, ...], folder: Path) -> None:
     """Record some episodes of a setting."""
     task = get_task(setting.task)
     agent = OpenLoop(task) if reference == "replay" else REFERENCES[reference].agent(task, TRAINING_SEED, None)
     os.environ[FOLDER] = str(folder)
-    env = ConstructSkillEnv(
-        setting.task,
-        episode_length=setting.episode_length,
-        render_backend="none",
-        perturb=setting.perturb,
-        perturb_seed=setting.perturb_seed,
-    )
+    env = ConstructSkillEnv(**setting.environment, render_backend="none")
     for start in starts:
         act(env, agent, start)
     env.close()
@@ -98,7 +92,7 @@ def main(suite: str, reference: str, root: Path) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         jobs = [
             pool.submit(run, setting, reference, starts, folder)
-            for setting in SUITES[suite].settings.values()
+            for setting in BOARD_SUITES[suite].settings.values()
             for starts in batched(setting.starts, TOGETHER)  # noqa: B911  the last one may be shorter
         ]
         for job in jobs:

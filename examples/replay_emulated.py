@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from lerobot_constructskill.board.replay import difference, open_simulator
-from lerobot_constructskill.board.submission import read_submission, width
+from lerobot_constructskill.board.submission import read_submission
 
 
 def main(root: Path, episodes: int) -> None:
@@ -19,9 +19,9 @@ def main(root: Path, episodes: int) -> None:
     print(f"torch finds {torch.backends.cpu.get_cpu_capability()}")
     submission = read_submission(root)
     for name, setting in submission.declaration.settings.items():
-        env = open_simulator(setting)
+        env = open_simulator(setting.environment)
         for claim in [claim for claim in submission.claims if claim.setting == name][:episodes]:
-            print(difference(env, claim, width(setting)) or f"{claim.where}: as claimed, {claim.steps} steps")
+            print(difference(env, claim) or f"{claim.label}: as claimed, {claim.steps} steps")
         env.close()
 
 

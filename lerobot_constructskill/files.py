@@ -289,7 +289,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, most: int | N
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
-        raise InputError(f"'{path}' cannot be read: {first_line(error)[:200].rstrip('.')}.") from None
+        raise InputError(f"'{path}' cannot be read: {first_line(error)[:200].rstrip('.')!a}.") from None
     return table
 
 

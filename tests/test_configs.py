@@ -18,7 +18,7 @@ from metadata import write_metadata
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill import presets, tags
-from lerobot_constructskill.board.protocol import SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
@@ -165,11 +165,11 @@ def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():
         parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study for name in ("precise", "ladder")
     )
     assert (ladder.variants, ladder.training) == (precise.variants, precise.training)
-    for name, setting in SUITES["ladder"].settings.items():
+    for name, setting in BOARD_SUITES["ladder"].settings.items():
         fields = ladder.settings[name].env
         assert (fields["task"], fields["episode_length"]) == (setting.task, setting.episode_length)
         assert range(ladder.eval_seed, ladder.eval_seed + ladder.episodes) == setting.starts
-    assert ladder.settings.keys() == SUITES["ladder"].settings.keys()
+    assert ladder.settings.keys() == BOARD_SUITES["ladder"].settings.keys()
 
 
 def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites():

@@ -23,8 +23,8 @@ import lerobot_constructskill
 from lerobot_constructskill import files
 from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.artifacts.tables import Parquet
-from lerobot_constructskill.board.collect import of_study
-from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.from_recordings import recorded_by_study
+from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.comparison.read import read_study
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import Json, Yaml, bounded_memory, parse_yaml, read_bytes, read_parquet, read_text
@@ -77,7 +77,7 @@ def test_whatever_a_file_is_a_value_or_one_sentence_that_names_it(reader, tmp_pa
 DOORS = {
     "a report": write_report,
     "a comparison": lambda root: read_study(root, "brick_to_bin_shifted/heat_maps"),
-    "a submission": lambda root: of_study(root, root, "heat_maps", {"one": Setting("brick_to_bin")}),
+    "a submission": lambda root: recorded_by_study(root, root, "heat_maps", {"one": BoardSetting("brick_to_bin")}),
 }
 
 
@@ -122,11 +122,10 @@ PASSED = (
     "json.loads(errors)",  # of columns that `Parquet.json` has checked
     "json.loads(text",
     "json.loads(row.versions)",
-    "json.loads(_one({one.versions",
+    "json.loads(_only({claim.versions",
     "tomllib.loads(read_text(",
     "files(__package__)",
     "log.read_text(",  # what LeRobot said to this process
-    "pq.ParquetFile(pa.BufferReader(content)",  # a stranger's, under bounds of its own
 )
 
 

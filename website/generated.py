@@ -16,7 +16,7 @@ import griffe
 from lerobot_constructskill.analysis.report.page import read_study
 from lerobot_constructskill.analysis.stats.outcomes import count, runs_of
 from lerobot_constructskill.board.exports import TABLE
-from lerobot_constructskill.board.protocol import SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.contract import FPS, SHIPPED, Task
 from lerobot_constructskill.study.rows import read_environments
@@ -129,7 +129,9 @@ def board(root: Path) -> dict[str, str | bytes]:
     with TemporaryDirectory() as folder:
         made = [*write_board(root / "board", Path(folder)), Path(folder) / TABLE]
         files: dict[str, str | bytes] = {f"board/{path.name}": path.read_bytes() for path in made}
-    suites = "\n".join(f"- [`{name}`](../board/{name}.html): {', '.join(SUITES[name].settings)}" for name in SUITES)
+    suites = "\n".join(
+        f"- [`{name}`](../board/{name}.html): {', '.join(BOARD_SUITES[name].settings)}" for name in BOARD_SUITES
+    )
     files["site/board.md"] = (
         "# The board\n\nA page for each suite, with every entry's interval over training seeds and the outcome of "
         f"every episode:\n\n{suites}\n\n[All entries](../board/index.html), and every episode of them as "

@@ -1,46 +1,23 @@
-"""The board's entries: submissions, what is known of each, and what their seeds reached in every setting."""
+"""The board's entries: submissions, how far each was verified, and what their seeds reached in every setting."""
 
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import date
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.spread import mean_rate
-from lerobot_constructskill.board.protocol import CLAIMED, LEVELS, RANKED_FROM, TRAINING_SEEDS
-from lerobot_constructskill.board.submission import (
-    NAME,
-    Claim,
-    Declaration,
-    Submission,
-    is_replayable,
-    read_submission,
-)
-from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.board.declaration import NAME, Declaration
+from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS
+from lerobot_constructskill.board.submission import Claim, Submission, read_submission
+from lerobot_constructskill.board.verification import read_verification
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.files import Json
-
-
-class Verdict(TypedDict):
-    """What a file in `VERIFIED` holds: of which submission, how far and when it was verified, with what, and where."""
-
-    submission: str
-    level: Literal[LEVELS]
-    date: date
-    versions: dict[str, str]
-    machines: NotRequired[list[str]]  # before 2026-11-24 none was named
-    rerun: NotRequired[dict[str, Any]]
-
-
-VERDICT = Json("a verdict of constructskill-verify", Verdict)
 
 ENTRIES, VERIFIED = "entries", "verified"
-"""Folders of a board: what strangers submit, and what its keepers found when they verified it."""
+"""Folders of a board: what anybody submits, and what its keepers found when they verified it."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +58,13 @@ class Entry:
 
     @property
     def is_reference(self) -> bool:
-        """Whether it is a floor or a ceiling: it does not see what a policy sees, has no rank and misses no seeds."""
-        return self.said.about.observes not in OBS_TYPES
+        """Whether it is a floor or a ceiling, which has no rank and lacks no seeds."""
+        return not self.said.about.is_policy
 
     @property
     def is_ranked(self) -> bool:
-        enough = len(self.said.training_seeds) >= RANKED_FROM
-        return not self.is_reference and enough and self.level != CLAIMED and is_replayable(self.said)
+        is_checked = self.level != CLAIMED and self.said.is_replayable
+        return is_checked and not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
 
     @property
     def missing_seeds(self) -> int:
@@ -96,18 +73,17 @@ class Entry:
 
     @cached_property
     def standings(self) -> dict[str, Standing]:
+        """What it reached in each of its settings, by name."""
         return {name: self._standing(name) for name in self.said.settings}
 
     def _standing(self, setting: str) -> Standing:
-        claims = {seed: [] for seed in sorted(self.said.training_seeds)}
-        for claim in sorted(self.submission.claims, key=lambda claim: claim.key):
-            if claim.setting == setting:
-                claims[claim.training_seed].append(claim)
+        there = sorted((one for one in self.submission.claims if one.setting == setting), key=lambda one: one.key)
+        claims = {seed: list(own) for seed, own in groupby(there, key=lambda one: one.training_seed)}
         placed, lifted = (
             mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]))
             for of in ("placed", "lifted")
         )
-        return Standing(claims, placed, lifted, sum(one.error is not None for own in claims.values() for one in own))
+        return Standing(claims, placed, lifted, errors=sum(one.error is not None for one in there))
 
 
 class Read(NamedTuple):
@@ -121,12 +97,11 @@ def read_entries(root: Path) -> Read:
     """Every entry of a board's folder. Raises MissingError where there is no such folder."""
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
-    # What ends in .partial is being written, or was when its process was killed.
     if (root / VERIFIED).exists() and not (root / VERIFIED).is_dir():
         raise InputError(f"'{root / VERIFIED}' is not a folder of verdicts.")
     read = Read([], [])
     for path in sorted((root / ENTRIES).iterdir()):
-        if path.suffix != ".partial":
+        if path.suffix != ".partial":  # an entry is being written, or was when its process was killed
             try:
                 read.entries.append(_entry(root, path))
             except (InputError, MissingError) as error:
@@ -138,34 +113,22 @@ def _entry(root: Path, path: Path) -> Entry:
     if not NAME.allows(path.name):
         raise InputError(f"the folder of an entry must be called by {NAME.meaning}.")
     submission = read_submission(path)
-    verdict = read_verdict(root / VERIFIED / f"{path.name}.json", {"submission": submission.sha256})
+    verdict = read_verification(root / VERIFIED / f"{path.name}.json", submission.sha256)
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
-
-
-def read_verdict(path: Path, of: Mapping[str, Any]) -> dict[str, Any]:
-    """What was found and recorded in a file, if it says what `of` says; empty otherwise.
-
-    Raises:
-        InputError: the file is no verdict.
-    """
-    if not os.path.lexists(path):
-        return {}
-    verdict = {"machines": []} | VERDICT.read(path)
-    return verdict if all(verdict.get(name) == value for name, value in of.items()) else {}
 
 
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     """Rank of each entry that has one in a setting, and whether it is shared.
 
-    Only those that were evaluated alike are compared: what a setting is called is up to a custom entry. An entry is
+    Only entries of one class that were evaluated alike are compared: a custom entry names its settings. An entry is
     behind those whose interval over seeds lies wholly above its own, so an entry that no seeds put behind another has
     rank 1. Two intervals that overlap can have different ranks: a third may lie above one of them alone.
     """
     alike: dict[tuple, dict[str, Estimate]] = {}
     for entry in entries:
         if entry.is_ranked and setting in entry.standings:
-            placed = alike.setdefault(entry.said.settings[setting].compared, {})
-            placed[entry.name] = entry.standings[setting].placed
+            kind = entry.said.settings_class, entry.said.settings[setting].compared
+            alike.setdefault(kind, {})[entry.name] = entry.standings[setting].placed
     found = {}
     for placed in alike.values():
         rank = {name: 1 + sum(other.low > own.high for other in placed.values()) for name, own in placed.items()}

@@ -1,9 +1,8 @@
-"""The board's rows for others: one parquet file, LeRobot's eval_info.json, .eval_results, and vla-eval's board."""
+"""Exports of the board: one Parquet file, LeRobot's eval_info.json, the Hub's .eval_results, and vla-eval's board."""
 
 import json
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import fields
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,11 @@ import yaml
 from lerobot_constructskill.artifacts.folders import replaced, write_text
 from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
-from lerobot_constructskill.board.submission import Claim
+from lerobot_constructskill.board.submission import SCHEMA, Claim
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 
 TABLE, EXPORTS = "board.parquet", "exports"
+EVAL_INFO, EVAL_RESULTS = "eval_info.json", ".eval_results/constructskill.yaml"
 
 
 def write_table(entries: Iterable[Entry], path: Path) -> None:
@@ -31,8 +31,8 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
             "suite": entry.said.suite,
             "class": entry.said.settings_class,
             "level": entry.level,
-            "task": entry.said.settings[claim.setting].task,
-            **{one.name: getattr(claim, one.name) for one in fields(Claim) if one.name != "actions"},
+            "task": claim.task,
+            **{name: getattr(claim, name) for name in SCHEMA.names if name != "actions"},
         }
         for entry in entries
         for claim in entry.submission.claims
@@ -42,7 +42,7 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
 
 
 def eval_info(entry: Entry, seed: int) -> dict[str, Any]:
-    """What `lerobot-eval` would have written of one training seed; times and films are not known."""
+    """What `lerobot-eval` would have written of one training seed, but for times and films."""
     per_task = [
         {"task_group": setting, "task_id": 0, "metrics": _metrics(standing.claims[seed])}
         for setting, standing in entry.standings.items()
@@ -52,18 +52,19 @@ def eval_info(entry: Entry, seed: int) -> dict[str, Any]:
 
 
 def _metrics(claims: list[Claim]) -> dict[str, list]:
+    rewards = [_rewards(claim) for claim in claims]
     return {
-        "sum_rewards": [sum(_rewards(claim)) for claim in claims],
-        "max_rewards": [max(_rewards(claim)) for claim in claims],
+        "sum_rewards": [sum(own) for own in rewards],
+        "max_rewards": [max(own, default=0.0) for own in rewards],
         "successes": [claim.placed for claim in claims],
         "video_paths": [],
     }
 
 
 def _rewards(claim: Claim) -> list[float]:
-    """The reward of every step: the stage reached by then. An episode that failed with an error has none of it."""
+    """The reward of every step: that of the stage reached by then."""
     lifted, placed = (inf if step is None else step for step in (claim.lift_step, claim.place_step))
-    steps = range(1, max(claim.steps, 1) + 1)
+    steps = range(1, claim.steps + 1)
     return [REWARD_PLACED if step >= placed else REWARD_LIFTED if step >= lifted else 0.0 for step in steps]
 
 
@@ -130,36 +131,26 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
 
 
 def _is_official(entry: Entry) -> bool:
-    """Whether it is a policy on the suite's own settings, whose names others know, and was replayed."""
+    """Whether an entry is a policy on the suite's own settings, whose names others know, and was replayed."""
     return entry.said.settings_class == STANDARD and not entry.is_reference and entry.level != CLAIMED
 
 
 def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
-    """Write all of them: a folder for each entry in `exports`, and the files that are of all."""
+    """Write the table of all entries, and in `exports` a folder for each entry and a file of all.
+
+    What earlier calls wrote there is removed first, as an entry may have been withdrawn; other files stay.
+    """
     write_table(entries, out / TABLE)
-    for gone in {path.name for path in (out / EXPORTS).glob("*/")} - {entry.name for entry in entries}:
-        _withdraw(out / EXPORTS / gone)
-    _write(out / EXPORTS / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2))
-    for entry in entries:
-        folder = out / EXPORTS / entry.name
-        for seed in entry.said.training_seeds:
-            _write(folder / f"seed_{seed}" / "eval_info.json", json.dumps(eval_info(entry, seed), indent=2))
-        results = folder / ".eval_results" / "constructskill.yaml"
-        if dataset_id and _is_official(entry):
-            _write(results, eval_results(entry, dataset_id))
-        elif not _is_official(entry):
-            results.unlink(missing_ok=True)  # of when it was
-
-
-def _withdraw(folder: Path) -> None:
-    """Remove what was written of an entry that is no longer there, and nothing else."""
-    for file in (*folder.glob("seed_*/eval_info.json"), folder / ".eval_results" / "constructskill.yaml"):
-        file.unlink(missing_ok=True)
-        with suppress(OSError):  # it holds something of somebody's, or is not there
+    exports = out / EXPORTS
+    for file in [*exports.glob(f"*/seed_*/{EVAL_INFO}"), *exports.glob(f"*/{EVAL_RESULTS}")]:
+        file.unlink()
+        with suppress(OSError):  # a folder is not empty
             file.parent.rmdir()
-    with suppress(OSError):
-        folder.rmdir()
-
-
-def _write(path: Path, text: str) -> None:
-    write_text(path, text.rstrip() + "\n")
+            file.parents[1].rmdir()
+    write_text(exports / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2) + "\n")
+    for entry in entries:
+        for seed in entry.said.training_seeds:
+            text = json.dumps(eval_info(entry, seed), indent=2) + "\n"
+            write_text(exports / entry.name / f"seed_{seed}" / EVAL_INFO, text)
+        if dataset_id and _is_official(entry):
+            write_text(exports / entry.name / EVAL_RESULTS, eval_results(entry, dataset_id))

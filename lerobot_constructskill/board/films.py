@@ -5,9 +5,9 @@ from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.board.entries import Entry
-from lerobot_constructskill.board.protocol import HORIZON, Setting
+from lerobot_constructskill.board.protocol import HORIZON
 from lerobot_constructskill.board.replay import open_simulator, open_workers
-from lerobot_constructskill.board.submission import Claim, is_replayable, width
+from lerobot_constructskill.board.submission import Claim
 from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.lerobot_internals import write_video
 from lerobot_constructskill.progress import Progress, quiet
@@ -30,24 +30,16 @@ def write_films(entries: Sequence[Entry], out: Path) -> None:
     Raises:
         OSError: a worker died, or there is nothing to render with.
     """
-    missing = [
-        (entry.said.settings[name], claim, out / path)
-        for entry in entries
-        for name in entry.standings
-        for path, claim in _films(entry, name).items()
-        if not (out / path).exists()
-    ]
-    if not missing:
-        return
+    films = [film for entry in entries for name in entry.standings for film in _films(entry, name).items()]
     with open_workers() as submit:
-        running = [submit(_film, *job) for job in missing]
+        running = [submit(_film, claim, out / path) for path, claim in films if not (out / path).exists()]
         for future in Progress(running, "filming", unit="episode"):
             future.result()
 
 
 def _films(entry: Entry, setting: str) -> dict[str, Claim]:
     """The first episode of a setting that placed and the first that did not; another submission's have other paths."""
-    if not is_replayable(entry.said):
+    if not entry.said.is_replayable:
         return {}
     claims = [one for own in entry.standings[setting].claims.values() for one in own if one.error is None]
     firsts = [next((one for one in claims if one.placed == placed), None) for placed in (True, False)]
@@ -56,17 +48,15 @@ def _films(entry: Entry, setting: str) -> dict[str, Claim]:
     return {f"{folder}/{named.format(one)}": one for one in firsts if one is not None}
 
 
-def _film(setting: Setting, claim: Claim, path: Path) -> None:
-    """Film an episode's first `HORIZON` steps: a stranger's setting may have 10,000, whose frames take 8 GB."""
-    env = open_simulator(setting, "auto")
+def _film(claim: Claim, path: Path) -> None:
+    """Film an episode's first `HORIZON` steps: a setting may have 10,000, whose frames take 8 GB."""
+    env = open_simulator(claim.environment, "auto")
     try:
         env.reset(seed=claim.evaluation_seed)
         frames = [env.render()]
-        for action in claim.actions.reshape(-1, width(setting))[:HORIZON]:
-            _, _, terminated, truncated, _ = env.step(action)
+        for action in claim.executed[:HORIZON]:
+            env.step(action)
             frames.append(env.render())
-            if terminated or truncated:
-                break
     finally:
         env.close()
     with replaced(path) as partial, quiet():

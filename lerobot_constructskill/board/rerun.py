@@ -1,147 +1,109 @@
-"""The highest level: the checkpoint evaluated anew, on starts that nobody could know when it was submitted."""
+"""The level re-run: the checkpoints are evaluated again, on starts that nobody could know before."""
 
-from collections import defaultdict
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict
 
 import numpy as np
+import yaml
 
 from lerobot_constructskill.analysis.stats.comparisons import holm
 from lerobot_constructskill.analysis.stats.spread import mean_p_value
-from lerobot_constructskill.board.protocol import RERUN_ALPHA, Setting, fresh_settings, fresh_start
+from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
 
 
-@dataclass(frozen=True)
-class Rates:
-    """Share of episodes that placed in one setting: as submitted, and run anew.
-
-    Args:
-        p_value: of a permutation test, two-tailed and corrected by Holm over the settings. Its unit is the start: the
-            checkpoints are the same in both, so starts of one kind could be dealt to the two at random. Where there is
-            one start alone, it is the training seed.
-    """
-
-    setting: str
-    submitted: float
-    again: float
-    p_value: float
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether fresh starts went worse than chance explains."""
-        return self.again < self.submitted and self.p_value < RERUN_ALPHA
-
-    @property
-    def sentence(self) -> str:
-        return f"{self.setting} {self.submitted:.0%} submitted, {self.again:.0%} run anew"
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A submission beside its re-run.
-
-    Args:
-        value: the public random number.
-        rates: a row for every setting.
-    """
-
-    value: str
-    rates: list[Rates]
-
-    @property
-    def sentence(self) -> str:
-        return f"Placed, on its own starts and on fresh ones: {'; '.join(one.sentence for one in self.rates)}."
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        return {"value": self.value, "settings": {one.setting: [one.submitted, one.again] for one in self.rates}}
-
-    def confirm(self) -> None:
-        """Raise InputError where fresh starts went worse than chance explains."""
-        if worse := [f"{one.sentence} (p = {one.p_value:.2g})" for one in self.rates if one.is_worse]:
-            raise InputError(f"The re-run does not confirm it: {'; '.join(worse)}.")
-
-
 def instructions(submission: Submission, value: str) -> str:
-    """From which starts to run a submission's checkpoint anew, and how.
+    """From which starts to run a submission's checkpoints again, and how.
+
+    Args:
+        value: the public random number, as of `protocol.fresh_start`.
 
     Raises:
-        InputError: it is no policy that looks, so that there is no checkpoint to run.
+        InputError: it is a reference, which has no checkpoint.
     """
-    _check_looks(submission)
+    _check_policy(submission)
     declaration = submission.declaration
     first = fresh_start(submission.sha256, value)
     settings = fresh_settings(declaration.settings, first)
-    lines = [f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:"]
-    for setting in settings.values():
-        perturb = f" --env.perturb='{setting.perturb}' --env.perturb_seed={setting.perturb_seed}" * _is_drawn(setting)
-        lines.append(
-            "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
-            f"--env.task={setting.task} --env.obs_type={declaration.about.observes} "
-            f"--env.episode_length={setting.episode_length}{perturb} --eval.n_episodes={setting.episodes} "
-            f"--eval.batch_size=1 --seed={first}"
-        )
-    lines.append("Then make a submission of it with these settings, and verify it with --value and --rerun:")
-    for name, one in settings.items():
-        perturbed = f", perturb: '{one.perturb}', perturb_seed: {one.perturb_seed}" * _is_drawn(one)
-        lines.append(
-            f"'{name}': {{task: {one.task}, episodes: {one.episodes}, "
-            f"episode_length: {one.episode_length}, first_start: {first}{perturbed}}}"
-        )
-    return "\n".join(lines)
+    flags = [" ".join(f"--env.{name}='{one}'" for name, one in own.environment.items()) for own in settings.values()]
+    commands = [
+        "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
+        f"{env} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} --eval.batch_size=1 "
+        f"--seed={first}"
+        for env, setting in zip(flags, settings.values(), strict=True)
+    ]
+    plain = {name: asdict(setting) for name, setting in settings.items()}
+    return "\n".join(
+        [
+            f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:",
+            *commands,
+            "Then make a submission of it with these settings, and verify it with --value and --rerun:",
+            yaml.safe_dump(plain, default_flow_style=None, sort_keys=False, width=300).strip(),
+        ]
+    )
 
 
-def _check_looks(submission: Submission) -> None:
-    about = submission.declaration.about
-    if about.observes not in OBS_TYPES:
-        raise InputError(
-            f"{about.name} observes {about.observes}: a re-run evaluates the checkpoint of a policy that observes "
-            f"{' or '.join(OBS_TYPES)}."
-        )
+def compare_rerun(submission: Submission, again: Submission, value: str) -> dict[str, tuple[float, float]]:
+    """Compare a re-run with its submission.
 
+    A permutation test, two-tailed and corrected by Holm over the settings, decides whether fresh starts went worse.
+    Its unit is the start: the checkpoints are the same in both, so starts of one kind could be dealt to the two at
+    random. Where there is one start alone, the unit is the training seed.
 
-def _is_drawn(setting: Setting) -> bool:
-    """Whether it names a perturbation or a draw, which a re-run's settings have to repeat."""
-    return bool(setting.perturb or setting.perturb_seed)
+    Args:
+        value: the public random number, as of `protocol.fresh_start`.
 
-
-def compare(submission: Submission, again: Submission, value: str) -> Comparison:
-    """Set a re-run beside its submission.
+    Returns:
+        For each setting the share of episodes that placed, as submitted and run again.
 
     Raises:
-        InputError: it is no policy that looks, the re-run is not from the starts or not of the training seeds that it
-            should be, or they are too few for the test to refuse anything.
+        InputError: fresh starts went worse than chance explains, or are too few to show that; it is a reference, or
+            the re-run is not from the starts or not of the training seeds that it should be.
     """
-    _check_looks(submission)
+    _check_policy(submission)
     first = fresh_start(submission.sha256, value)
     if again.declaration.settings != fresh_settings(submission.declaration.settings, first):
         raise InputError(f"{value!a:.80} calls for the starts from {first} on; the re-run has others.")
     if set(again.declaration.training_seeds) != set(submission.declaration.training_seeds):
         raise InputError("The re-run does not have the submission's training seeds.")
     names = sorted(submission.declaration.settings)
-    pairs = [(placed(submission, name), placed(again, name)) for name in names]
-    could_be = holm([mean_p_value(np.ones(len(own)), np.zeros(len(fresh))) for own, fresh in pairs])
+    pairs = [(_placed(submission, name), _placed(again, name)) for name in names]
+    could_be = holm([mean_p_value(np.ones_like(own), np.zeros_like(fresh)) for own, fresh in pairs])
     if min(could_be) >= RERUN_ALPHA:
         raise InputError(
             "Too few starts to confirm anything: if all placed as submitted and none anew, p would be "
             f"{min(could_be):.2g}, not below {RERUN_ALPHA}."
         )
-    p_values = holm([mean_p_value(*pair) for pair in pairs])
-    rows = zip(names, pairs, p_values, strict=True)
-    return Comparison(value, [Rates(name, own.mean(), fresh.mean(), p) for name, (own, fresh), p in rows])
+    rates = {name: (own.mean(), fresh.mean()) for name, (own, fresh) in zip(names, pairs, strict=True)}
+    p_values = dict(zip(names, holm([mean_p_value(*pair) for pair in pairs]), strict=True))
+    worse = {name: own for name, own in rates.items() if own[1] < own[0] and p_values[name] < RERUN_ALPHA}
+    if worse:
+        told = "; ".join(f"{describe({name: own})} (p = {p_values[name]:.2g})" for name, own in worse.items())
+        raise InputError(f"The re-run does not confirm it: {told}.")
+    return rates
 
 
-def placed(submission: Submission, setting: str) -> np.ndarray:
+def describe(rates: dict[str, tuple[float, float]]) -> str:
+    """The rates of `compare_rerun` as text."""
+    return "; ".join(f"{name} {own:.0%} submitted, {again:.0%} run anew" for name, (own, again) in rates.items())
+
+
+def _check_policy(submission: Submission) -> None:
+    about = submission.declaration.about
+    if not about.is_policy:
+        raise InputError(
+            f"{about.name} observes {about.observes}: a re-run evaluates the checkpoint of a policy that observes "
+            f"{' or '.join(OBS_TYPES)}."
+        )
+
+
+def _placed(submission: Submission, setting: str) -> np.ndarray:
     """Share of the training seeds that placed, from each start of a setting, (starts,); errors count as failed.
 
     Of a setting with one start: which training seeds placed, (training seeds,).
     """
-    unit = "training_seed" if submission.declaration.settings[setting].episodes == 1 else "evaluation_seed"
-    by_unit = defaultdict(list)
-    for claim in submission.claims:
-        if claim.setting == setting:
-            by_unit[getattr(claim, unit)].append(claim.placed)
-    return np.array([np.mean(of) for of in by_unit.values()])
+    claims = sorted((one for one in submission.claims if one.setting == setting), key=lambda one: one.key)
+    placed = np.array([claim.placed for claim in claims], dtype=float)  # by training seed, then by start
+    placed = placed.reshape(len(submission.declaration.training_seeds), -1)
+    return placed[:, 0] if placed.shape[1] == 1 else placed.mean(axis=0)

@@ -1,6 +1,5 @@
-"""The board as a static site: a page a suite, each one file that needs neither network nor script."""
+"""Writes the board as a static site: a page for each suite, a file that needs neither network nor script."""
 
-from collections.abc import Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.films import films_there, write_films
-from lerobot_constructskill.board.protocol import CLASSES, LEVELS, RANKED_FROM, SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES, CLASSES, LEVELS, RANKED_FROM
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import InputError, plural
 
@@ -21,11 +20,11 @@ STYLE = Path(__file__).parents[1] / "analysis" / "report" / "templates"
 
 ERROR = "error"
 CELLS = (*STAGES, ERROR)
-"""What an episode's cell can be."""
+"""Kinds of outcome of an episode, each with a colour."""
 
 
 def write_board(root: Path, out: Path, dataset_id: str | None = None, films: bool = False) -> list[Path]:
-    """Write the pages of a board's folder, and its rows for others.
+    """Write the pages of a board's folder, and the exports.
 
     Args:
         dataset_id: as of `exports.eval_results`, which are not written without it.
@@ -43,28 +42,26 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
     if films:
         write_films(entries, out)
     day = datetime.now(UTC).date().isoformat()
-    pages = {f"{suite}.html": _suite_page(suite, entries, out, day) for suite in SUITES}
-    pages["index.html"] = _render("index.html", entries=entries, suites=SUITES, day=day)
+    pages = {f"{suite}.html": _suite_page(suite, entries, out, day) for suite in BOARD_SUITES}
+    pages["index.html"] = _render("index.html", entries=entries, suites=BOARD_SUITES, day=day)
     for name, text in pages.items():
         write_text(out / name, text)
     write_exports(entries, out, day, dataset_id)
     if refused:
-        more = f" And {len(refused) - 1} more." if len(refused) > 1 else ""
-        raise InputError(f"The board in {out} is without what cannot be read. {refused[0]}{more}")
+        raise InputError(f"The board in {out} is without what cannot be read. {' '.join(refused)}")
     return [out / name for name in pages]
 
 
 def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
     own = [entry for entry in entries if entry.said.suite == name]
-    columns = list(dict.fromkeys([*SUITES[name].settings, *(one for entry in own for one in entry.said.settings)]))
-    # Custom settings may be called as the suite's: they are ranked among themselves.
-    classes = {kind: [entry for entry in own if entry.said.settings_class == kind] for kind in CLASSES}
-    ranked = {column: _ranks(classes.values(), column) for column in columns}
+    suite = BOARD_SUITES[name]
+    columns = list(dict.fromkeys([*suite.settings, *(one for entry in own for one in entry.said.settings)]))
+    ranked = {column: ranks(own, column) for column in columns}
     return _render(
         "suite.html",
         name=name,
-        suite=SUITES[name],
-        suites=SUITES,
+        suite=suite,
+        suites=BOARD_SUITES,
         entries=sorted(own, key=lambda entry: _place(entry, ranked)),
         columns=columns,
         ranks=ranked,
@@ -78,12 +75,8 @@ def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
     )
 
 
-def _ranks(classes: Iterable[list[Entry]], column: str) -> dict[str, tuple[int, bool]]:
-    return {name: rank for entries in classes for name, rank in ranks(entries, column).items()}
-
-
 def _place(entry: Entry, ranked: dict[str, dict[str, tuple[int, bool]]]) -> tuple:
-    """Where an entry is written: policies first, by class, by ranks, the worst compared first, by rates, by name."""
+    """Key to sort entries by: policies first, then by class, by ranks from the worst on, by rates, by name."""
     own = sorted((of[entry.name][0] for of in ranked.values() if entry.name in of), reverse=True)
     rates = [standing.placed.value for standing in entry.standings.values()]
     kind = CLASSES.index(entry.said.settings_class)
@@ -91,7 +84,10 @@ def _place(entry: Entry, ranked: dict[str, dict[str, tuple[int, bool]]]) -> tupl
 
 
 def grid(standing: Standing) -> Markup:
-    """Every episode of a setting as a cell: a row a training seed, a column a start; a path a kind of outcome."""
+    """Draw every episode of a setting as a cell: a row for each training seed, a column for each start.
+
+    The cells of one kind of outcome are one path, which keeps pages small.
+    """
     kinds: dict[str, list[str]] = {kind: [] for kind in CELLS}
     for y, claims in enumerate(standing.claims.values()):
         for x, claim in enumerate(claims):

@@ -12,7 +12,7 @@ import pandas as pd
 
 from lerobot_constructskill.comparison.sides import Placements, Side, check_equal, conditions, merge_versions
 from lerobot_constructskill.contract import LOOSE, SUITES
-from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Recording, read_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.lerobot_internals import EVALUATED as EVAL_INFO
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
@@ -142,7 +142,7 @@ def read_recorded(name: str, folders: Sequence[Path]) -> Side:
     return recorded_side(name, f"recordings of {plural(len(folders), 'training seed')}", by_folder)
 
 
-def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Recording]]) -> Side:
+def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Episode]]) -> Side:
     """Make a side of recordings, by the folder of each training seed. Raises as `read_recorded` does."""
     recordings = list(chain(*by_folder.values()))
     envs = [{name: getattr(one, name) for name in STARTING} for one in recordings]

@@ -1,4 +1,4 @@
-"""What was executed in an environment and what came of it: a row an episode, so that anyone can execute it again.
+"""The episode: where it was run, what was executed and how it went, in memory and as a row of a Parquet file.
 
 Where `$CONSTRUCTSKILL_RECORD` names a folder, every environment writes each of its finished episodes there, whatever
 runs it: `lerobot-eval`, an evaluation harness, a loop of one's own. A study keeps its runs' episodes the same way.
@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
-from lerobot_constructskill.contract import STAGES
+from lerobot_constructskill.contract import STAGES, get_task
 from lerobot_constructskill.perturbations import Perturbation
 
 FOLDER = "CONSTRUCTSKILL_RECORD"
@@ -30,21 +30,44 @@ FOLDER = "CONSTRUCTSKILL_RECORD"
 RECORDINGS = "recordings.parquet"
 """Where a study's run keeps what it executed."""
 
-STARTING = ("task", "episode_length", "perturb", "perturb_seed", "obs_type")
-"""Arguments of `ConstructSkillEnv` that with a seed decide an episode's start, its end and what a policy is shown."""
+ENVIRONMENT = ("task", "episode_length", "perturb", "perturb_seed")
+"""Arguments of `ConstructSkillEnv` that with a seed decide an episode's start and its end."""
+
+STARTING = (*ENVIRONMENT, "obs_type")
+"""The same and what a policy is shown."""
+
+OUTCOME = ("lifted", "placed", "stage", "lift_step", "place_step", "steps")
+"""Fields of `Episode` that executing its actions again has to come to."""
 
 DECIDING = ("sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
 
 
 def deciding() -> dict[str, str]:
-    """Their versions here, our revisions, and the make of the processor: PhysX computes with its approximations."""
+    """Versions of `DECIDING`, our revisions, and the make of the processor, whose approximations PhysX uses."""
     return versions(*DECIDING) | code_of(__name__) | {"processor": make()}
 
 
 @dataclass
-class Outcome:
-    """How an episode went; the fields are those of `rows.EpisodeRow`."""
+class Episode:
+    """One episode.
+
+    Args:
+        evaluation_seed: seed of the initial state.
+        lifted: whether the object was lifted at any step.
+        placed: whether it was placed at any step.
+        stage: the furthest of `contract.STAGES` reached.
+        lift_step, place_step: first step after which the object counted as lifted, as placed.
+        steps: how many were executed.
+        task, episode_length, perturb, perturb_seed: as of `ConstructSkillEnv`.
+        obs_type: what the policy was shown.
+        backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
+        versions: JSON, as `deciding` gives them.
+        clipped_steps: how many of the actions were clipped; None where nobody counted.
+        final_error_m: distance of the object from the goal's centre at the end, in metres; None where not measured.
+        actions: every executed action in order, in pieces whose concatenation is (steps * A) float32, as
+            `ConstructSkillEnv.step` takes them.
+    """
 
     evaluation_seed: int
     lifted: bool = False
@@ -53,10 +76,22 @@ class Outcome:
     lift_step: int | None = None
     place_step: int | None = None
     steps: int = 0
+    task: str = ""
+    episode_length: int = 0
+    perturb: str = ""
+    perturb_seed: int = 0
+    obs_type: str = ""
+    backend: str = ""
+    versions: str = "{}"
+    clipped_steps: int | None = None
+    final_error_m: float | None = None
+    actions: list[np.ndarray] = field(default_factory=list)
 
-    def count(self, info: Mapping[str, Any]) -> None:
-        """Count one step, of which the environment said `info`."""
+    def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
+        """Count an executed action, (A,), of which the environment said `info`, and keep a copy of it."""
+        self.actions.append(np.array(action, dtype=np.float32))
         self.steps += 1
+        self.clipped_steps = info["clipped_steps"]
         if info["is_lifted"] and not self.lifted:
             self.lifted, self.lift_step = True, self.steps
         if info["is_success"] and not self.placed:  # a task may ask for more than the paper's placement
@@ -64,74 +99,45 @@ class Outcome:
         reached = ("lifted", self.lifted), ("in_bin", info["is_in_bin"]), ("placed", self.placed)
         self.stage = max([self.stage, *(stage for stage, is_reached in reached if is_reached)], key=STAGES.index)
 
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """The fields named in `OUTCOME`."""
+        return {name: getattr(self, name) for name in OUTCOME}
 
-@dataclass
-class Recording(Outcome):
-    """An episode's outcome, where it was had, and its actions.
-
-    Args:
-        task, episode_length, perturb, perturb_seed: as of `ConstructSkillEnv`; with the seed they decide its start.
-        obs_type: what the policy was shown.
-        backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
-        versions: JSON, as `deciding` gives them.
-        clipped_steps: how many of the actions were clipped; None where nobody counted.
-        actions: every executed action, one after another, (steps * A) float32 as `ConstructSkillEnv.step` takes them.
-    """
-
-    task: str = ""
-    episode_length: int = 0
-    perturb: str = ""
-    perturb_seed: int = 0
-    obs_type: str = ""
-    backend: str = ""
-    versions: str = field(default_factory=lambda: json.dumps(deciding()))
-    clipped_steps: int | None = None
-    actions: list[np.ndarray] = field(default_factory=list)
-
-    def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
-        """Keep a copy of an executed action, (A,), and count what came of it."""
-        self.actions.append(np.array(action, dtype=np.float32))
-        self.count(info)
-        self.clipped_steps = info["clipped_steps"]
-
-    @classmethod
-    def of(cls, outcome: Outcome, actions: list[np.ndarray], **facts: Any) -> "Recording":
-        """The recording of an episode that has ended; `facts` are the other fields of `Recording`."""
-        went = {one.name: getattr(outcome, one.name) for one in fields(Outcome)}
-        clipped = getattr(outcome, "clipped_steps", None)  # a submission's claim has no such field
-        return cls(**went, clipped_steps=clipped, actions=actions, **facts)
+    @property
+    def environment(self) -> dict[str, Any]:
+        """The fields named in `ENVIRONMENT`."""
+        return {name: getattr(self, name) for name in ENVIRONMENT}
 
     @property
     def flat(self) -> np.ndarray:
         """All actions, (steps * A,) float32."""
         return np.concatenate(self.actions) if self.actions else np.zeros(0, np.float32)
 
-    def write(self, folder: Path) -> Path:
+    @property
+    def executed(self) -> np.ndarray:
+        """All actions, (steps, A) float32."""
+        return self.flat.reshape(-1, len(get_task(self.task).action_names))
+
+    def write(self, folder: Path) -> None:
         """Write a file of its own, named by what is in it: an equal episode is the same file."""
-        said = hashlib.sha256(self.flat.tobytes()).hexdigest()[:12]
+        hashed = hashlib.sha256(self.flat.tobytes()).hexdigest()[:12]
         label = Perturbation(self.perturb, self.perturb_seed).label
-        path = folder / f"{self.task}{label}-{self.episode_length}-{self.evaluation_seed}-{said}.parquet"
-        write_recordings([self], path)
-        return path
+        name = f"{self.task}{label}-{self.episode_length}-{self.evaluation_seed}-{hashed}.parquet"
+        write_recordings([self], folder / name)
 
 
-ACTIONS = pa.list_(pa.field("element", pa.float32(), nullable=False))
+ACTIONS = {list[np.ndarray]: pa.list_(pa.field("element", pa.float32(), nullable=False))}
+"""Python's and Arrow's type of actions; `artifacts.tables` knows those of all other fields."""
 
-TABLE = Parquet(
-    "a recording", Recording, {list[np.ndarray]: ACTIONS}, later=("clipped_steps",), json={"versions": VERSIONS}
+RECORDED = Parquet(
+    "a recording", Episode, ACTIONS, later=("clipped_steps", "final_error_m"), json={"versions": VERSIONS}
 )
 
 
-def compressed(actions: str) -> dict[str, Any]:
-    """How Parquet is to write a column of `ACTIONS`: like bytes of neighbouring numbers stand together."""
-    leaf = f"{actions}.list.element"
-    split = {"use_dictionary": False, "column_encoding": {leaf: "BYTE_STREAM_SPLIT"}}
-    return {"compression": "zstd", "compression_level": 19, **split}
-
-
-def recorder(**facts: Any) -> Recording | None:
-    """A new recording, if this process records; `facts` are fields of `Recording`."""
-    return Recording(**facts) if os.environ.get(FOLDER) else None
+def recorder(**facts: Any) -> Episode | None:
+    """A new episode to record, if this process records; `facts` are fields of `Episode`."""
+    return Episode(**facts, versions=json.dumps(deciding())) if os.environ.get(FOLDER) else None
 
 
 def recording_into(folder: str | None, make: Callable[[], Any]) -> Any:
@@ -145,26 +151,35 @@ def recording_into(folder: str | None, make: Callable[[], Any]) -> Any:
     return make()
 
 
-def keep(recording: Recording | None) -> None:
-    """Write a finished recording into the folder that is named."""
-    if recording is not None:
-        recording.write(Path(os.environ[FOLDER]))
+def keep(recording: Episode) -> None:
+    """Write a finished episode into the folder that `$CONSTRUCTSKILL_RECORD` names."""
+    recording.write(Path(os.environ[FOLDER]))
 
 
-def write_recordings(recordings: Iterable[Recording], path: Path) -> None:
-    """Write a parquet file, which appears whole or not at all."""
-    rows = [vars(each) | {"actions": each.flat} for each in recordings]
+def write_recordings(episodes: Iterable[Episode], path: Path, schema: pa.Schema = RECORDED.schema) -> None:
+    """Write a Parquet file, which appears whole or not at all.
+
+    Args:
+        schema: columns of the file; each is a field of the episodes, and one of them is `actions`.
+    """
+    table = pa.Table.from_pylist([vars(one) | {"actions": one.flat} for one in episodes], schema=schema)
+    # Split by byte, like bytes of neighbouring numbers stand together and compress.
+    options = {"use_dictionary": False, "column_encoding": {"actions.list.element": "BYTE_STREAM_SPLIT"}}
     with replaced(path) as partial:
-        pq.write_table(pa.Table.from_pylist(rows, schema=TABLE.schema), partial, **compressed("actions"))
+        pq.write_table(table, partial, compression="zstd", compression_level=19, **options)
 
 
-def read_recordings(path: Path) -> list[Recording]:
-    """Read a file of recordings of one's own.
+def read_recordings(path: Path) -> list[Episode]:
+    """Read a file of recordings.
 
     Raises:
         InputError: it holds something else.
     """
-    table = TABLE.read(path)
-    flat = [np.asarray(actions.values) for actions in table["actions"]]
+    return [Episode(**row) for row in to_rows(RECORDED.read(path))]
+
+
+def to_rows(table: pa.Table) -> list[dict[str, Any]]:
+    """The rows of a table of episodes: column to value, the actions of each as one array in a list."""
+    actions = [[np.asarray(flat.values)] for flat in table["actions"]]
     rows = table.drop_columns("actions").to_pylist()
-    return [Recording(**row, actions=[actions]) for row, actions in zip(rows, flat, strict=True)]
+    return [row | {"actions": own} for row, own in zip(rows, actions, strict=True)]

@@ -1,7 +1,7 @@
-"""What a rollout can drive an environment with: any LeRobot policy, and anything else that acts."""
+"""Agents, which act in an environment: any LeRobot policy, and anything else with the methods of `Agent`."""
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -24,7 +24,7 @@ class Observation:
 
     Args:
         seen: the environment's observation.
-        sim: privileged state, `contract.SIM_STATE` name to float32 array; for experts alone.
+        sim: privileged state, `contract.SIM_STATE` name to float32 array, which only experts may use.
         instruction: the task's sentence.
     """
 
@@ -36,7 +36,7 @@ class Observation:
 class Agent(Protocol):
     """Something that acts in one environment.
 
-    It may have an attribute `cameras`, the names of those that it looks at; without it, it is shown every camera.
+    It may have an attribute `cameras`, the names of the cameras that it looks at. Without it, every camera is shown.
     """
 
     def reset(self, seed: int) -> None:
@@ -46,20 +46,16 @@ class Agent(Protocol):
         """Return the action of this step, float32 (A,), in metres with the gripper last."""
 
 
-class _Step(TypedDict):
+class _RegisteredStep(TypedDict):
     registry_name: str
 
 
-class _Pipeline(TypedDict):
-    steps: list[_Step]
-
-
-PIPELINE = Json("a processor whose steps are all registered", _Pipeline)
-"""A step that has a `class` in place of its name in LeRobot's registry may be any function, which would be called."""
+PIPELINE = Json("a processor whose steps are all registered", TypedDict("_Pipeline", {"steps": list[_RegisteredStep]}))
+"""LeRobot calls any function that a step names as its `class` in place of a name in its registry."""
 
 
 def _check_files(checkpoint: Path) -> None:
-    """Refuse a folder that would hang, or run what somebody wrote into it; a name on the Hub is LeRobot's to judge."""
+    """Refuse a folder in which reading would hang, or that names functions to call. Names on the Hub pass."""
     for path in checkpoint.glob("*"):
         if path.is_fifo() or path.is_char_device():
             raise InputError(f"'{path}' is not a regular file.")
@@ -70,7 +66,7 @@ def _check_files(checkpoint: Path) -> None:
 class PolicyAgent:
     """A LeRobot policy between its two processors, as `lerobot-eval` runs it.
 
-    A policy that samples its actions draws them from the episode's seed and the step, whatever else runs beside it.
+    A policy that samples its actions draws them from the episode's seed and the step alone.
 
     Args:
         policy: the policy, in evaluation mode.
@@ -87,7 +83,7 @@ class PolicyAgent:
         """Load a checkpoint folder, or a name on the Hub, of any policy type that is installed.
 
         Args:
-            overrides: fields of its configuration, in place of its own where they are not None.
+            overrides: fields of its configuration; None leaves a field as it is.
 
         Raises:
             ValueError: its configuration cannot be read, or is of an unknown type.
@@ -113,7 +109,7 @@ class PolicyAgent:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that are among the policy's inputs; every camera where it knows pictures by other names."""
+        """The cameras that are among the policy's inputs; every camera where it has other names for pictures."""
         named = {camera.key: name for name, camera in CAMERAS.items()}
         pictures = self.policy.config.image_features
         renamed = any(getattr(step, "rename_map", None) for step in getattr(self.preprocessor, "steps", ()))
@@ -144,29 +140,41 @@ class PolicyAgent:
         self._step += 1
         device = torch.device(self.policy.config.device)
         amp = torch.autocast(device.type, enabled=self.policy.config.use_amp)
-        with torch.random.fork_rng([device] if device.type == "cuda" else []), amp:
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), amp, observing(batch, OFFERED):
             torch.manual_seed(int(drawn))
-            action = self._select(batch)
+            action = self.policy.select_action(batch)
         return self.postprocessor(action).squeeze(0).cpu().numpy()
 
-    def _select(self, batch: dict[str, Any]) -> torch.Tensor:
-        try:
-            return self.policy.select_action(batch)
-        except KeyError as error:
-            if not (name := str(error).strip("'")).startswith("observation."):
-                raise
-            raise InputError(
-                f"The policy reads {name}, which it was not shown: obs_type=pixels_agent_pos has the wrist "
-                "camera and the state; pixels has the base camera alone."
-            ) from error
+
+OFFERED = "obs_type=pixels_agent_pos has the wrist camera and the state; pixels has the base camera alone"
+
+
+@contextmanager
+def observing(shown: Container[str], offered: str) -> Iterator[None]:
+    """Turn the KeyError of a policy that reads an observation which it is not shown into a sentence.
+
+    Args:
+        shown: names of the observations that it is shown.
+        offered: which observations there are and where.
+
+    Raises:
+        InputError: inside the block a policy looked for another observation.
+    """
+    try:
+        yield
+    except KeyError as error:
+        name = str(error).strip("'")
+        if not name.startswith("observation.") or name in shown:
+            raise
+        raise InputError(f"The policy reads {name}, which it is not shown: {offered}.") from error
 
 
 class Lockstep:
-    """Many agents of which each acts once a step; what several policies of a class compute alike is computed once.
+    """Many agents that act once in each step. What several policies of a class compute alike is computed once.
 
-    A policy class takes part by an attribute `in_lockstep`: called with its policies by number it returns a function,
-    which is called with their preprocessed batches by number. It returns batches that `select_action` takes as well,
-    or an exception in place of a batch.
+    A policy class takes part by an attribute `in_lockstep`. Called with its policies by number, it returns a function
+    from their preprocessed batches by number to batches that `select_action` takes as well. In place of a batch it may
+    return an exception.
     """
 
     def __init__(self, agents: Sequence[Agent]):
@@ -183,24 +191,19 @@ class Lockstep:
 
     def act(self, observations: Mapping[int, Observation]) -> dict[int, np.ndarray | Exception]:
         """The action of every agent, by number, or the exception that it raised."""
-        answers: dict[int, Any] = {}
-        batches: dict[int, dict] = {}
-        for number, observation in observations.items():
-            agent = self._agents[number]
-            if not isinstance(agent, PolicyAgent):
-                answers[number] = caught(agent.act, observation)
-            elif isinstance(batch := caught(agent.see, observation), Exception):
-                answers[number] = batch
-            else:
-                batches[number] = batch
+        acting = {number: self._agents[number] for number in observations}
+        policies = {number: agent for number, agent in acting.items() if isinstance(agent, PolicyAgent)}
+        batches = {number: caught(agent.see, observations[number]) for number, agent in policies.items()}
         for numbers, share in self._shared.items():
-            own = {number: batches[number] for number in numbers if number in batches}
+            own = {number: batches[number] for number in numbers if isinstance(batches.get(number), Mapping)}
             seen = caught(share, own)
             batches |= dict.fromkeys(own, seen) if isinstance(seen, Exception) else seen
-        for number, batch in batches.items():
-            failed = isinstance(batch, Exception)
-            answers[number] = batch if failed else caught(self._agents[number].decide, batch)
-        return answers
+        decided = {
+            number: batch if isinstance(batch, Exception) else caught(policies[number].decide, batch)
+            for number, batch in batches.items()
+        }
+        others = acting.keys() - policies.keys()
+        return decided | {number: caught(acting[number].act, observations[number]) for number in others}
 
 
 def caught(call: Callable[..., Any], *args: Any) -> Any:

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Subset
 
 from lerobot_constructskill.contract import TRANSLATION
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.offline import ask, check_actions, observed, shown
+from lerobot_constructskill.rollout.offline import ask, check_actions, observed, observing_frames
 
 FRAMES, BATCH = 512, 32
 """How many frames are looked at, at most, and how many at a time."""
@@ -44,7 +44,7 @@ def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[in
     check_actions(agent.policy, dataset)
     view = Subset(observed(dataset, agent.policy), frames)
     on_gpu = [agent.policy.config.device] if agent.policy.config.device.startswith("cuda") else []
-    with shown(dataset), torch.random.fork_rng(on_gpu):
+    with observing_frames(dataset), torch.random.fork_rng(on_gpu):
         torch.manual_seed(0)
         pipeline = agent.policy, agent.preprocessor, agent.postprocessor
         chunks = np.concatenate([ask(*pipeline, batch)[1].float().cpu().numpy() for batch in DataLoader(view, BATCH)])

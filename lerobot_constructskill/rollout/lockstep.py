@@ -1,13 +1,14 @@
 """Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder."""
 
+import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lerobot_constructskill.contract import OBS_TYPES, get_task
-from lerobot_constructskill.envs.recording import STARTING, Outcome, Recording
+from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
@@ -17,32 +18,18 @@ OnStep = Callable[[int, int, np.ndarray, Step], None]
 
 
 @dataclass
-class Episode(Outcome):
-    """How an evaluation episode went; the fields are those of `rows.EpisodeRow`."""
-
-    final_error_m: float | None = None
-    clipped_steps: int | None = None
-
-    def add(self, step: Step) -> None:
-        """Count one step of the episode."""
-        self.count(step.info)
-        self.clipped_steps = step.info["clipped_steps"]
-        self.final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
-
-
-@dataclass
 class Rollout:
-    """What became of one agent: its episodes and the actions of each, or why it failed."""
+    """What became of one agent: its episodes, or the exception by which it failed."""
 
     episodes: list[Episode] = field(default_factory=list)
-    actions: list[list[np.ndarray]] = field(default_factory=list)
     error: Exception | None = None
     backend: str | None = None
 
-    def recordings(self, env_kwargs: Mapping[str, Any]) -> list[Recording]:
-        """What was executed, an episode each; `env_kwargs` have all of `recording.STARTING`."""
-        facts = {name: env_kwargs[name] for name in STARTING} | {"backend": self.backend}
-        return [Recording.of(*pair, **facts) for pair in zip(self.episodes, self.actions, strict=True)]
+    def recordings(self, env_kwargs: Mapping[str, Any]) -> list[Episode]:
+        """The episodes with the environment that they were run in; `env_kwargs` have all of `recording.STARTING`."""
+        facts = {name: env_kwargs[name] for name in STARTING}
+        facts |= {"backend": self.backend, "versions": json.dumps(deciding())}
+        return [replace(episode, **facts) for episode in self.episodes]
 
 
 def roll_out(
@@ -63,32 +50,28 @@ def roll_out(
         filmed: agents of whom `on_step` is shown every camera; of others, those that the agent looks at.
 
     Yields:
-        An agent's number and its outcome, as soon as it has finished or failed.
+        An agent's number and its rollout, as soon as it has finished or failed.
 
     Raises:
         OSError: a simulator's process died.
     """
-    task = get_task(env_kwargs.get("task", "brick_to_bin"))
-    longest = env_kwargs.get("episode_length") or task.horizon
-    most = len(agents) * len(seeds) * longest
     envs = [env_kwargs if i in filmed else _rendered(agent, env_kwargs) | env_kwargs for i, agent in enumerate(agents)]
     with (
         simulators(envs, n_workers) as sims,
-        Progress(total=most, unit="step", desc="rollout") as bar,
+        Progress(total=len(agents) * len(seeds), unit="episode", desc="rollout") as bar,
     ):
-        lanes = _Lanes(agents, task.instruction, sims, seeds, on_step)
+        lanes = _Lanes(agents, env_kwargs, sims, seeds, on_step)
         bar.unpause()  # until now the simulators started
-        while lanes.current:
-            bar.total = bar.n + lanes.steps_left(longest)
-            bar.update(len(lanes.current))
-            bar.set_postfix(running=len(lanes.current), refresh=False)
-            lanes.advance()
-            yield from lanes.settled()
-        yield from lanes.settled()
+        running = set(range(len(agents)))
+        while running:
+            bar.update(lanes.advance())
+            for i in running - lanes.current.keys():
+                running.remove(i)
+                yield i, lanes.rollouts[i]
 
 
 def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Have rendered what an agent looks at; one camera at least, as a backend that renders is a part of the result."""
+    """Which cameras to render: those that an agent looks at, one at least, as a row says what backend rendered."""
     offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
     looked = getattr(agent, "cameras", offered)
     return {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
@@ -97,55 +80,50 @@ def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 class _Lanes:
     """The agents that still run, and what each of them sees."""
 
-    def __init__(self, agents, instruction: str, sims: Simulators, seeds: Sequence[int], on_step: OnStep | None):
+    def __init__(
+        self,
+        agents: Sequence[Agent],
+        env_kwargs: Mapping[str, Any],
+        sims: Simulators,
+        seeds: Sequence[int],
+        on_step: OnStep | None,
+    ):
         self.agents, self.sims, self.seeds, self.on_step = agents, sims, seeds, on_step
-        self.instruction = instruction
+        self.instruction = get_task(env_kwargs.get("task", "brick_to_bin")).instruction
         self.lockstep = Lockstep(agents)
-        self.outcomes = [Rollout() for _ in agents]
+        self.rollouts = [Rollout() for _ in agents]
         self.current: dict[int, Step] = {}
-        self._reported: set[int] = set()
         self._start(range(len(agents)))
 
-    def advance(self) -> None:
-        """One step of every agent that still runs."""
+    def advance(self) -> int:
+        """Take one step with every agent that still runs, and return how many episodes ended."""
         seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in self.current.items()}
-        actions = self._settle(self.lockstep.act(seen))
-        self.current = self._settle(self.sims.step(actions))
+        actions = self._succeeded(self.lockstep.act(seen))
+        self.current = self._succeeded(self.sims.step(actions))
         for i, step in self.current.items():
-            self.outcomes[i].episodes[-1].add(step)
-            self.outcomes[i].actions[-1].append(np.array(actions[i]))  # an agent may use its array again
+            episodes = self.rollouts[i].episodes
+            episodes[-1].add(actions[i], step.info)
+            episodes[-1].final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
             if self.on_step:
-                self.on_step(i, len(self.outcomes[i].episodes) - 1, actions[i], step)
+                self.on_step(i, len(episodes) - 1, actions[i], step)
         finished = [i for i, step in self.current.items() if step.done]
         for i in finished:
             del self.current[i]
-        self._start([i for i in finished if len(self.outcomes[i].episodes) < len(self.seeds)])
-
-    def steps_left(self, longest: int) -> int:
-        """At most so many steps are left, where an episode has at most `longest`."""
-        left = (self.outcomes[i].episodes for i in self.current)
-        return sum((len(self.seeds) - len(episodes) + 1) * longest - episodes[-1].steps for episodes in left)
-
-    def settled(self) -> Iterator[tuple[int, Rollout]]:
-        """The agents that have stopped since this was last asked."""
-        for i in set(range(len(self.agents))) - self.current.keys() - self._reported:
-            self._reported.add(i)
-            if self.outcomes[i].error is None:
-                self.outcomes[i].backend = self.sims.backend(i)
-            yield i, self.outcomes[i]
+            self.rollouts[i].backend = self.sims.backend(i)
+        self._start([i for i in finished if len(self.rollouts[i].episodes) < len(self.seeds)])
+        return len(finished)
 
     def _start(self, numbers: Sequence[int]) -> None:
         """Begin the next episode of these agents."""
-        seeds = {i: self.seeds[len(self.outcomes[i].episodes)] for i in numbers}
+        seeds = {i: self.seeds[len(self.rollouts[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
-            self.outcomes[i].episodes.append(Episode(seed))
-            self.outcomes[i].actions.append([])
-        ready = self._settle({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})
-        self.current |= self._settle(self.sims.reset({i: seeds[i] for i in ready}))
+            self.rollouts[i].episodes.append(Episode(seed))
+        ready = self._succeeded({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})
+        self.current |= self._succeeded(self.sims.reset({i: seeds[i] for i in ready}))
 
-    def _settle(self, results: dict[int, Any]) -> dict[int, Any]:
-        """Take out the agents whose result is an exception: they have failed."""
+    def _succeeded(self, results: dict[int, Any]) -> dict[int, Any]:
+        """The results that are no exception; an agent whose result is one has failed."""
         for i, result in results.items():
             if isinstance(result, Exception):
-                self.outcomes[i] = Rollout(error=result)
+                self.rollouts[i] = Rollout(error=result)
         return {i: result for i, result in results.items() if not isinstance(result, Exception)}

@@ -1,12 +1,12 @@
-"""What a policy predicts on held-out demonstrations: how far its actions are from theirs, and how steady its chunks.
+"""Errors of a policy's predictions on held-out demonstrations, and the consistency of its chunks.
 
 Every policy is asked the same of every frame, as it was asked in training: a fresh chunk from that frame's
 observation. Action queues and temporal ensembling, which mix chunks of several frames, play no part. Policies that
 sample (diffusion, flow) draw anew for every frame, which their consistency includes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader, Subset
 from lerobot_constructskill.contract import GRIPPER, TRANSLATION
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.agents import PolicyAgent, observing
 
 
 @dataclass(frozen=True)
@@ -126,21 +126,10 @@ def check_actions(policy: PreTrainedPolicy, dataset: LeRobotDataset) -> None:
         )
 
 
-@contextmanager
-def shown(dataset: LeRobotDataset) -> Iterator[None]:
-    """Refuse a policy that asks for an observation, by the name that its own processors give, which is not there.
-
-    Raises:
-        InputError: inside the block it looks for one that the data set does not have.
-    """
-    try:
-        yield
-    except KeyError as error:
-        key = str(error.args[0])
-        if not key.startswith("observation.") or key in dataset.meta.features:
-            raise
-        has = ", ".join(name for name in dataset.meta.features if name.startswith("observation."))
-        raise InputError(f"The policy reads {key}; '{dataset.repo_id}' has {has}.") from None
+def observing_frames(dataset: LeRobotDataset) -> AbstractContextManager[None]:
+    """Context in which a policy that reads an observation which a data set lacks is an InputError, not a KeyError."""
+    has = ", ".join(name for name in dataset.meta.features if name.startswith("observation."))
+    return observing(dataset.meta.features, f"'{dataset.repo_id}' has {has}")
 
 
 def predict(
@@ -164,15 +153,12 @@ def predict(
     rows = [dataset.meta.episodes[episode] for episode in episodes]
     spans = [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
     predictions = []
-    with Progress(total=sum(map(len, spans)), desc=policy.name, unit="frame", leave=False) as bar:
-        for span in spans:
-            policy.reset()
-            batches = []
-            for batch in DataLoader(Subset(dataset, span), batch_size):
-                batches.append(ask(policy, preprocess, postprocess, batch))
-                bar.update(len(batch["action"]))
-            labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*batches, strict=True))
-            predictions.append(Predictions(labels, chunks))
+    for span in Progress(spans, policy.name, unit="demo", leave=False):
+        policy.reset()
+        batches = DataLoader(Subset(dataset, span), batch_size)
+        asked = [ask(policy, preprocess, postprocess, batch) for batch in batches]
+        labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*asked, strict=True))
+        predictions.append(Predictions(labels, chunks))
     return predictions
 
 
@@ -180,10 +166,10 @@ def predict(
 def ask(
     policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Labels (B, A) of a batch, and chunks (B, C, A) that a policy predicts; C is 1 where it predicts none.
+    """Labels (B, A) of a batch, and the chunks (B, C, A) that a policy predicts; C is 1 for a policy without chunks.
 
     Raises:
-        InputError: it makes its chunks from a queue of past observations.
+        InputError: the policy makes its chunks from a queue of past observations.
     """
     seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
     seen = preprocess(seen | {name: batch[name] for name in ("task", "index")})
@@ -203,9 +189,9 @@ def ask(
 
 
 def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
-    """The data set with as many observations a frame as the policy was trained on.
+    """Open the data set again with as many observations in a frame as the policy was trained on.
 
-    A policy class whose policies read what was computed of images takes part by a method `read_features`.
+    A policy class that reads features in place of images has a method `read_features`, which is called here.
 
     Raises:
         InputError: another encoder than the policy's made the data set's features.
@@ -239,12 +225,7 @@ def policy_errors(
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
         if frame["phase"] in phases:
-            wanted = frame["action"] if labels == "advice" else _clean_action(frame)
-            errors.append((action - wanted.numpy())[:3])
+            clean = frame["dart.executed_action"][:3] - frame["dart.noise"]
+            wanted = frame["action"][:3] if labels == "advice" else clean
+            errors.append(action[:3] - wanted.numpy())
     return np.array(errors, dtype=np.float64).reshape(-1, 3)
-
-
-def _clean_action(frame: dict) -> torch.Tensor:
-    clean = frame["dart.executed_action"].clone()
-    clean[:3] -= frame["dart.noise"]
-    return clean

@@ -1,4 +1,4 @@
-"""Floors and ceilings: what a task asks of a policy, and what it does not. One entry of `REFERENCES` each.
+"""References, the floors and ceilings beside which results are read. Each is an entry of `REFERENCES`.
 
 A reference is an agent of its own, or a variant of the study with some fields of its policy set otherwise. Another
 package adds one with `REFERENCES["name"] = Reference(...)` where LeRobot imports it as a plugin.
@@ -49,7 +49,7 @@ class RandomAgent(NoOpAgent):
 
 
 class ReplayAgent(NoOpAgent):
-    """Executes what one demonstration executed, whatever it sees, and then stands still."""
+    """Executes the actions of one demonstration, whatever it sees, and then stands still."""
 
     def __init__(self, task: Task, demonstrations: LeRobotDataset, episode: int):
         super().__init__(task)
@@ -91,11 +91,11 @@ class Reference:
 
     Args:
         label: what tables call it.
-        agent: makes it for a task, a seed of its own and the setting's demonstrations (None unless it reads them).
-        reads_demonstrations: whether it does.
+        agent: makes the agent for a task, a seed and the setting's demonstrations (None unless it reads them).
+        reads_demonstrations: whether the agent reads the setting's demonstrations.
         policy: in place of an agent, fields that are set otherwise in the first variant whose policy has them.
-        is_expert: whether the scripted expert acts, whose code then shows in what it does.
-        looks: whether it sees the scene; what places without looking shows that a setting does not ask for it.
+        is_expert: whether the scripted expert acts, so that its code is part of what the rows were made with.
+        looks: whether it sees the scene. A setting in which one places that does not look asks for no looking.
     """
 
     label: str

@@ -1,13 +1,13 @@
 """Many environments in a few processes, each stepped on its own."""
 
-import multiprocessing
 import os
 import pickle
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,15 @@ DIED = "A simulator's process died; if there was not enough memory, run fewer at
 
 @dataclass(frozen=True)
 class Step:
-    """What an environment returned from `reset` or `step`, with its privileged state and its proprioception."""
+    """What an environment returned from `reset` or `step`.
+
+    Args:
+        seen: the observation.
+        sim: privileged state, `contract.SIM_STATE` name to float32 array.
+        done: whether the episode is over.
+        info: as of `ConstructSkillEnv.step`.
+        agent_state: proprioception, (8,) float32.
+    """
 
     seen: dict[str, Any]
     sim: dict[str, np.ndarray]
@@ -42,37 +50,38 @@ class Step:
 class Simulators:
     """Environments, spread over worker processes; environment i lives in worker i % workers.
 
-    Every method takes a mapping from an environment's number and answers with one, in which an environment that raised
-    has its exception. They raise `OSError` where a worker died, for want of memory for instance.
+    `reset` and `step` take a value for each environment by number, and return what each returned; in place of it
+    stands the exception of an environment that raised. They raise `OSError` where a worker died, for instance because
+    memory ran out.
     """
 
-    def __init__(self, workers: Sequence[Connection]):
+    def __init__(self, workers: Sequence[Executor]):
         self._workers = workers
 
     def reset(self, seeds: Mapping[int, int]) -> dict[int, Step | Exception]:
         """Start an episode in each named environment: number to seed."""
-        return self._ask("reset", seeds)
+        return self._ask(_reset, seeds)
 
     def step(self, actions: Mapping[int, np.ndarray]) -> dict[int, Step | Exception]:
         """Advance each named environment: number to action."""
-        return self._ask("step", actions)
+        return self._ask(_step, actions)
 
     def backend(self, number: int) -> str:
         """What simulates and renders an environment that has been reset."""
-        return self._ask("backend", {number: None})[number]
+        return self._ask(_backend, {number: None})[number]
 
-    def _ask(self, verb: str, arguments: Mapping[int, Any]) -> dict[int, Any]:
+    def _ask(self, call: Callable[..., Any], arguments: Mapping[int, Any]) -> dict[int, Any]:
         shares = [{} for _ in self._workers]
         for number, argument in arguments.items():
             shares[number % len(shares)][number] = argument
-        asked = [(worker, share) for worker, share in zip(self._workers, shares, strict=True) if share]
         answers: dict[int, Any] = {}
         try:
-            for worker, share in asked:
-                worker.send((verb, share))
-            for worker, _ in asked:
-                answers |= worker.recv()
-        except (EOFError, ConnectionError):
+            asked = [
+                worker.submit(_answer, call, own) for worker, own in zip(self._workers, shares, strict=True) if own
+            ]
+            for future in asked:
+                answers |= future.result()
+        except BrokenExecutor:
             raise MachineError(DIED) from None
         return answers
 
@@ -80,55 +89,44 @@ class Simulators:
 @contextmanager
 def simulators(env_kwargs: Sequence[Mapping[str, Any]], n_workers: int | None = None) -> Iterator[Simulators]:
     """Open a `ConstructSkillEnv(**kwargs)` for each of `env_kwargs` in `n_workers` processes (one per core)."""
-    context = multiprocessing.get_context("forkserver")
     start_fork_server(PRELOADED)
-    n_workers = min(len(env_kwargs), n_workers or cores())
-    processes, connections = [], []
-    try:
-        for _ in range(n_workers):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, env_kwargs), daemon=True)
-            process.start()
-            theirs.close()
-            processes.append(process)
-            connections.append(ours)
-        yield Simulators(connections)
-    finally:
-        for connection in connections:
-            connection.close()
-        for process in processes:
-            process.join(timeout=10)
-            process.kill()
+    context = get_context("forkserver")
+    with ExitStack() as stack:
+        workers = [
+            stack.enter_context(ProcessPoolExecutor(1, context, _begin, (env_kwargs,)))
+            for _ in range(min(len(env_kwargs), n_workers or cores()))
+        ]
+        yield Simulators(workers)
 
 
-def _work(connection: Connection, env_kwargs: Sequence[Mapping[str, Any]]) -> None:
-    """Serve environments until the other side hangs up."""
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all of them; the other side handles it and hangs up
-    _use_one_thread()
-    envs: dict[int, ConstructSkillEnv] = {}
-
-    def answer(verb: str, number: int, argument: Any) -> Any:
-        if number not in envs:
-            envs[number] = ConstructSkillEnv(**env_kwargs[number])
-        return _VERBS[verb](envs[number], argument)
-
-    while True:
-        try:
-            verb, arguments = connection.recv()
-            connection.send({number: _attempt(answer, verb, number, one) for number, one in arguments.items()})
-        except (EOFError, ConnectionError):
-            break
-    for env in envs.values():
-        env.close()
+_env_kwargs: list[Mapping[str, Any]] = []
+_environments: dict[int, ConstructSkillEnv] = {}
+"""Of a worker process: arguments of all environments, and by number those that it has made."""
 
 
-def _use_one_thread() -> None:
-    """Workers share the cores; threads of theirs would stall each other."""
+def _begin(env_kwargs: Sequence[Mapping[str, Any]]) -> None:
+    """Prepare a worker process: it ends with its parent, ignores Ctrl-C, which its parent handles, and has one thread.
+
+    Workers share the cores; more threads would stall each other.
+    """
     import torch
 
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ["LP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+    _env_kwargs.extend(env_kwargs)
+
+
+def _answer(call: Callable[..., Any], arguments: Mapping[int, Any]) -> dict[int, Any]:
+    """Call a function with each numbered environment and its argument."""
+    return {number: _attempt(_on_environment, call, number, one) for number, one in arguments.items()}
+
+
+def _on_environment(call: Callable[..., Any], number: int, argument: Any) -> Any:
+    if number not in _environments:
+        _environments[number] = ConstructSkillEnv(**_env_kwargs[number])
+    return call(_environments[number], argument)
 
 
 def _reset(env: ConstructSkillEnv, seed: int) -> Step:
@@ -141,7 +139,8 @@ def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
     return Step(seen, env.privileged_state(), terminated or truncated, info, reward, env.agent_state())
 
 
-_VERBS = {"reset": _reset, "step": _step, "backend": lambda env, _: env.backend}
+def _backend(env: ConstructSkillEnv, _: None) -> str:
+    return env.backend
 
 
 def _attempt(call: Callable[..., Any], *arguments: Any) -> Any:

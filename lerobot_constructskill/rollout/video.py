@@ -1,4 +1,4 @@
-"""A video of one agent's first episode, from the base camera."""
+"""Videos of rollouts: one agent's first episode, seen by the base camera."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ class FirstEpisode:
     """Keeps the frames of one agent's first episode.
 
     Args:
-        number: the agent's.
+        number: which agent is filmed; None for no agent.
     """
 
     def __init__(self, number: int | None):
@@ -24,12 +24,12 @@ class FirstEpisode:
         self._frames: list[np.ndarray] = []
 
     def add(self, number: int, episode: int, action: np.ndarray, step: Step) -> None:
-        """`lockstep.OnStep`."""
+        """Keep a frame of the first episode; called as `lockstep.OnStep`."""
         if number == self._number and episode == 0:
             self._frames.append(step.seen["pixels"][CAMERA])
 
     def write(self, number: int, path: Path) -> None:
-        """Write the video, if the agent is the one that was filmed."""
+        """Write the video of an agent, if it is the one that was filmed."""
         if number == self._number and self._frames:
             with quiet():
                 write_video(path, self._frames, FPS)

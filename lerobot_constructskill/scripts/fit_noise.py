@@ -52,7 +52,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     from lerobot_constructskill.parsing import decode
     from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.rollout.agents import PolicyAgent
-    from lerobot_constructskill.rollout.offline import check_actions, policy_errors, shown
+    from lerobot_constructskill.rollout.offline import check_actions, observing_frames, policy_errors
 
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
@@ -62,7 +62,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
         agent = PolicyAgent.from_pretrained(config.policy_path, device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     bar = Progress(episodes, "demonstrations", unit="demo")
-    with shown(dataset):
+    with observing_frames(dataset):
         noisy, labels = generator["noise"]["phases"], generator["labels"]
         errors = [policy_errors(agent, dataset, episode, noisy, labels) for episode in bar]
     covariance = fit_covariance(errors, config.alpha)

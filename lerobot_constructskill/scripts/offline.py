@@ -87,14 +87,20 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
     import torch
 
     from lerobot_constructskill.rollout.agents import PolicyAgent
-    from lerobot_constructskill.rollout.offline import check_actions, observed, offline_metrics, predict, shown
+    from lerobot_constructskill.rollout.offline import (
+        check_actions,
+        observed,
+        observing_frames,
+        offline_metrics,
+        predict,
+    )
 
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
     pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
-    with shown(dataset):
+    with observing_frames(dataset):
         predictions = predict(*pipeline, view, episodes, config.batch_size)
     return {
         "policy": agent.policy.name,

@@ -5,12 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from lerobot_constructskill.board.protocol import SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.bounds import Among, Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
-
-Suite = Annotated[str, Among(tuple(SUITES))]
 
 
 @dataclass
@@ -21,7 +19,7 @@ class SubmitConfig:
     `recorded/seed_<training seed>`.
     """
 
-    suite: Suite  # its settings and starts are evaluated
+    suite: Annotated[str, Among(tuple(BOARD_SUITES))]  # its settings and starts are evaluated
     about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; optional: url and notes
     root: Path  # the folder to write
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed
@@ -50,19 +48,22 @@ def submit(config: SubmitConfig) -> str:
         MissingError: something that was named is not there.
         InputError: an episode is missing, or a file is not what it should be.
     """
-    from lerobot_constructskill.board import collect
-    from lerobot_constructskill.board.submission import ABOUT, EPISODES, SETTINGS
+    from lerobot_constructskill.board import from_recordings
+    from lerobot_constructskill.board.declaration import ABOUT, SETTINGS
+    from lerobot_constructskill.board.submission import EPISODES_FILE
 
     about = ABOUT.read(config.about)
-    settings = SUITES[config.suite].settings if config.settings is None else SETTINGS.read(config.settings)
+    settings = BOARD_SUITES[config.suite].settings if config.settings is None else SETTINGS.read(config.settings)
     failures = {int(seed): why for seed, why in config.failures.items()}
     if config.study is None:
-        piles = collect.recorded_in(config.recorded)
+        recorded = from_recordings.recorded_in(config.recorded)
     else:
-        piles, said = collect.of_study(config.study, config.store, config.variant, settings, config.study_settings)
+        recorded, said = from_recordings.recorded_by_study(
+            config.study, config.store, config.variant, settings, config.study_settings
+        )
         failures = said | failures
-    made = collect.submit(config.root, about, config.suite, settings, piles, failures)
-    size = (config.root / EPISODES).stat().st_size
+    made = from_recordings.submit(config.root, about, config.suite, settings, recorded, failures)
+    size = (config.root / EPISODES_FILE).stat().st_size
     return (
         f"{config.root}: {made.declaration.settings_class}, {plural(len(made.claims), 'episode')} of "
         f"{plural(len(made.declaration.training_seeds), 'training seed')}, "

@@ -1,21 +1,11 @@
 """`constructskill-verify`: execute the actions of a submission again, and say which outcomes are not as claimed."""
 
-import json
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 from lerobot_constructskill.bounds import Count, Text, Workers, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
-
-SHOWN = 10
-"""Differences that are told in full."""
-
-_OTHER_MAKE = (
-    " Makes of processors differ in the last bits of physics, on which an episode seldom depends: verify it on the "
-    "make that it was made on."
-)
 
 
 @dataclass
@@ -49,81 +39,31 @@ def verify(config: VerifyConfig) -> str:
         InputError: it is not as it claims; the message says where.
         OSError: a worker died.
     """
+    from lerobot_constructskill.board.protocol import REPLAYED, RERUN
+    from lerobot_constructskill.board.replay import replay_submission
+    from lerobot_constructskill.board.rerun import compare_rerun, describe, instructions
     from lerobot_constructskill.board.submission import read_submission
+    from lerobot_constructskill.board.verification import record_verification
 
     submission = read_submission(config.root)
     if config.value is not None and config.rerun is None:
-        return _tell_rerun(submission, config.value)
-    rerun = _compared(submission, config) if config.rerun is not None else None
-    verdict = _replayed(submission, config)
-    told = (
-        f"{config.root} holds: {verdict.replayed} of {len(submission.claims)} episodes replayed "
-        f"({plural(verdict.steps, 'step')}), each ended as claimed; {verdict.failed} failed with an error."
-    )
-    facts = {"submission": submission.sha256, "level": "replayed", "versions": verdict.versions}
-    if rerun is not None:
-        again, comparison = rerun
-        _replayed(again, config)
-        comparison.confirm()
-        told, facts = f"{told} {comparison.sentence}", facts | {"level": "re-run", "rerun": comparison.facts}
+        return instructions(submission, config.value)
+    level, facts, told = REPLAYED, None, ""
+    if config.rerun is not None:  # compared before anything is replayed, which takes minutes
+        again = read_submission(config.rerun)
+        rates = compare_rerun(submission, again, config.value)
+        replay_submission(again, config.workers, config.sample)
+        level, facts = RERUN, {"value": config.value, "settings": {name: list(own) for name, own in rates.items()}}
+        told = f" Placed, on its own starts and on fresh ones: {describe(rates)}."
+    replayed = replay_submission(submission, config.workers, config.sample)
     if config.record is not None:
-        _record(config.record / f"{config.root.resolve().name}.json", facts)
-    return told
-
-
-def _record(path: Path, facts: dict) -> None:
-    """Write what was found. What else is known of the submission stays: the first date, other machines, a re-run."""
-    from lerobot_constructskill.artifacts.locks import locked
-
-    lock = path.with_name(f".{path.name}.lock")
-    with locked(lock):  # of two at once the second adds to what the first has written
-        _add(path, facts)
-        lock.unlink()
-
-
-def _add(path: Path, facts: dict) -> None:
-    from lerobot_constructskill.artifacts.folders import write_text
-    from lerobot_constructskill.artifacts.processor import processor
-    from lerobot_constructskill.board.entries import read_verdict
-    from lerobot_constructskill.board.protocol import CLAIMED, LEVELS
-
-    before = read_verdict(path, {"submission": facts["submission"]})
-    facts = {"date": before.get("date", datetime.now(UTC).date().isoformat())} | facts
-    if LEVELS.index(before.get("level", CLAIMED)) > LEVELS.index(facts["level"]):
-        facts |= {name: before[name] for name in ("level", "rerun") if name in before}
-    earlier = before["machines"] if before.get("versions") == facts["versions"] else []
-    machines = list(dict.fromkeys([*earlier, processor()]))
-    write_text(path, json.dumps(facts | {"machines": machines}, indent=2) + "\n")
-
-
-def _replayed(submission, config: VerifyConfig):
-    from lerobot_constructskill.artifacts.processor import make
-    from lerobot_constructskill.board.replay import replay
-
-    verdict = replay(submission, config.workers, config.sample)
-    if verdict.differences:
-        more = len(verdict.differences) - SHOWN
-        raise InputError(
-            f"{len(verdict.differences)} of {verdict.replayed} replayed episodes are not as claimed: "
-            f"{' '.join(verdict.differences[:SHOWN])}{f' And {more} more.' if more > 0 else ''}"
-            f"{'' if submission.declaration.versions.get('processor') == make() else _OTHER_MAKE}"
-        )
-    return verdict
-
-
-def _tell_rerun(submission, value: str) -> str:
-    from lerobot_constructskill.board.rerun import instructions
-
-    return instructions(submission, value)
-
-
-def _compared(submission, config: VerifyConfig):
-    """The re-run and what it says of the submission, before either is replayed, which takes minutes."""
-    from lerobot_constructskill.board.rerun import compare
-    from lerobot_constructskill.board.submission import read_submission
-
-    again = read_submission(config.rerun)
-    return again, compare(submission, again, config.value)
+        record_verification(config.record / f"{config.root.resolve().name}.json", submission.sha256, level, facts)
+    failed = sum(claim.error is not None for claim in submission.claims)
+    return (
+        f"{config.root} holds: {len(replayed)} of {len(submission.claims)} episodes replayed "
+        f"({plural(sum(claim.steps for claim in replayed), 'step')}), each ended as claimed; {failed} failed with an "
+        f"error.{told}"
+    )
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
-"""The rows of a study: one per evaluation episode, in one tidy parquet table. No torch, no simulator.
+"""The rows of a study: one per evaluation episode, in one tidy Parquet table. Imports neither torch nor a simulator.
 
-A run keeps its own episodes as `EpisodeRow`; the table of a study says of each which setting and variant it is, and
+A run keeps its episodes as `EpisodeRow`. The table of a study holds `Row`, which adds the setting and the variant, and
 has one row for every run that failed or has not been made.
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -16,26 +16,20 @@ from annotated_types import Ge
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
+from lerobot_constructskill.envs.recording import Episode
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.files import Json, Yaml
 
 STUDY, ROWS, PROVENANCE = "study.yaml", "rows.parquet", "provenance.json"
-"""Files in a study's folder: the study as it was read, its rows, and what is known of how they were made."""
+"""Files in a study's folder: the study as it was read, its rows, and facts about how they were made."""
 
 VARIANT, REFERENCE, SIGHTLESS = "variant", "reference", "sightless"
-"""Roles: what is compared; a floor or ceiling; one of those that does not look at the scene."""
+"""Roles: what is compared; a floor or ceiling; a floor or ceiling that does not look at the scene."""
 
 NOT_RUN = "not_run"
 """`error_kind` of a run that has not been made; any other kind is that of an exception (`errors.kind`)."""
 
-
-LATER = ("clipped_steps",)
-"""Columns that tables of before 2026-11-26 do not have."""
-
 ERRORS = Json("held-out errors in m2, data set to error", dict[str, float])
-
-
-Positive = Annotated[int, Ge(1)]
 
 
 class _Known(TypedDict, total=False):
@@ -48,7 +42,7 @@ KNOWN = Json("what is known of a study's making", _Known)
 
 class _Env(TypedDict):
     task: str
-    episode_length: NotRequired[Positive | None]
+    episode_length: NotRequired[Annotated[int, Ge(1)] | None]
     obs_type: NotRequired[str]
     perturb: NotRequired[str]
     perturb_seed: NotRequired[int]
@@ -66,7 +60,7 @@ SETTINGS = Yaml("a study's file", _Settings)
 
 
 def read_environments(root: Path) -> dict[str, dict[str, Any]]:
-    """How a study's folder says that each of its settings is evaluated: fields of `--env.type=constructskill`.
+    """Read where each setting of a study's folder is evaluated: fields of `--env.type=constructskill`, by setting.
 
     Raises:
         InputError: its file is not a study's.
@@ -75,7 +69,7 @@ def read_environments(root: Path) -> dict[str, dict[str, Any]]:
 
 
 def check_folder(root: Path) -> None:
-    """Refuse what is not the folder of a study.
+    """Refuse a folder that is not a study's.
 
     Raises:
         MissingError: its file or its rows are not there.
@@ -87,7 +81,7 @@ def check_folder(root: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeRow:
-    """One evaluation episode, or one run without any.
+    """One evaluation episode, or one run without any. Columns named as fields of `Episode` have their meaning.
 
     Args:
         run: digest of the run's specification; null for runs made before runs had one.
@@ -134,6 +128,11 @@ class EpisodeRow:
     backend: str | None = None
     versions: str | None = None
 
+    def filled(self, episode: Episode, number: int) -> "EpisodeRow":
+        """This row with the outcome of an episode, which has this number within the run."""
+        measured = {"final_error_m": episode.final_error_m, "clipped_steps": episode.clipped_steps}
+        return replace(self, evaluation_seed=episode.evaluation_seed, episode=number, **episode.outcome, **measured)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Row(EpisodeRow):
@@ -160,15 +159,18 @@ class Row(EpisodeRow):
     video: str | None = None
 
 
+LATER = ("clipped_steps",)
+"""Columns that tables of before 2026-11-26 do not have."""
+
 TABLES = {
-    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, later=LATER, json={"versions": VERSIONS}),
+    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, json={"versions": VERSIONS}, later=LATER),
     Row: Parquet(
-        "a table of a study's rows",
-        Row,
-        later=LATER,
-        json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS},
+        "a table of a study's rows", Row, json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS}, later=LATER
     ),
 }
+
+NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype(), pa.string(): pd.StringDtype()}
+"""Arrow's types and those of pandas that hold null as well."""
 
 
 def write_rows(rows: Iterable[EpisodeRow], path: Path, kind: type[EpisodeRow] = Row) -> None:
@@ -184,7 +186,7 @@ def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
     Raises:
         InputError: the file does not hold such rows.
     """
-    rows = TABLES[kind].read(path).to_pandas(types_mapper=_nullable)
+    rows = TABLES[kind].read(path).to_pandas(types_mapper=NULLABLE.get)
     if kind is Row and (wrong := {*rows["role"]} - {VARIANT, REFERENCE, SIGHTLESS}):
         raise InputError(f"'{path}' is not {TABLES[kind].what}: there is no role {min(wrong)!a}.")
     if kind is Row and (rows["episodes"] < 1).any():
@@ -195,7 +197,3 @@ def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
 def load_rows[Kind: EpisodeRow](path: Path, kind: type[Kind] = Row) -> list[Kind]:
     """Read the same as objects. Raises as `read_rows` does."""
     return [kind(**row) for row in TABLES[kind].read(path).to_pylist()]
-
-
-def _nullable(kind: pa.DataType):
-    return {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype(), pa.string(): pd.StringDtype()}.get(kind)

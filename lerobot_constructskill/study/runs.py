@@ -24,7 +24,7 @@ from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
-from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.errors import MachineError, TakenError, kind_of
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
@@ -273,7 +273,7 @@ def _checkpoint(job: Job, run: Run) -> Path:
 
 def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
     row = _row(job, run, rollout.backend)
-    rows = [replace(row, **vars(episode), episode=i) for i, episode in enumerate(rollout.episodes)]
+    rows = [row.filled(episode, i) for i, episode in enumerate(rollout.episodes)]
     return _write(job, run, rows, write_video, rollout.recordings(run.arm.env))
 
 
@@ -288,7 +288,7 @@ def _write(
     run: Run,
     rows: list[EpisodeRow],
     write_video: Callable[[Path], None] = lambda path: None,
-    recordings: Sequence[Recording] = (),
+    recordings: Sequence[Episode] = (),
 ) -> Run:
     with job.store.writing(run) as folder:
         folder.mkdir()

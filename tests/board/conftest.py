@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 
 ENTRIES = Path(__file__).parents[2] / "board" / "entries"
-SETTINGS = {task: Setting(task, episodes=2) for task in ("brick_to_bin_shifted", "block_to_bin")}
+SETTINGS = {task: BoardSetting(task, episodes=2) for task in ("brick_to_bin_shifted", "block_to_bin")}
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from lerobot_constructskill.board.submission import DECLARATION, EPISODES
+from lerobot_constructskill.board.submission import DECLARATION_FILE, EPISODES_FILE
 from lerobot_constructskill.perturbations import PICTURES
 
 type Forge = Callable[[Path, np.random.Generator], None]
@@ -33,26 +33,28 @@ def forges(into: dict[str, Forge]) -> Callable[[Forge], Forge]:
 
 def edit(root: Path, change: Callable[[list[dict]], None], schema: pa.Schema | None = None, **options) -> None:
     """Change the rows, and make the hash anew."""
-    table = pq.read_table(root / EPISODES)
+    table = pq.read_table(root / EPISODES_FILE)
     rows = table.to_pylist()
     change(rows)
-    pq.write_table(pa.Table.from_pylist(rows, schema=schema or table.schema), root / EPISODES, **options)
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema or table.schema), root / EPISODES_FILE, **options)
     rehash(root)
 
 
 def rehash(root: Path) -> None:
-    declare(root, lambda said: said.update(episodes_sha256=hashlib.sha256((root / EPISODES).read_bytes()).hexdigest()))
+    declare(
+        root, lambda said: said.update(episodes_sha256=hashlib.sha256((root / EPISODES_FILE).read_bytes()).hexdigest())
+    )
 
 
 def declare(root: Path, change: Callable[[dict], None]) -> None:
-    said = yaml.safe_load((root / DECLARATION).read_text())
+    said = yaml.safe_load((root / DECLARATION_FILE).read_text())
     change(said)
-    (root / DECLARATION).write_text(yaml.safe_dump(said, sort_keys=False))
+    (root / DECLARATION_FILE).write_text(yaml.safe_dump(said, sort_keys=False))
 
 
 def overwrite(root: Path, text: str) -> None:
     """Put lines before submission.yaml's own."""
-    (root / DECLARATION).write_text(text + (root / DECLARATION).read_text())
+    (root / DECLARATION_FILE).write_text(text + (root / DECLARATION_FILE).read_text())
 
 
 def placed(rows: list[dict], rng: np.random.Generator) -> dict:
@@ -109,16 +111,16 @@ def a_setting_called_as_a_harder_task(root, rng):
 
 @forges(READ)
 def a_bit_of_the_file(root, rng):
-    content = bytearray((root / EPISODES).read_bytes())
+    content = bytearray((root / EPISODES_FILE).read_bytes())
     content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
-    (root / EPISODES).write_bytes(content)
+    (root / EPISODES_FILE).write_bytes(content)
 
 
 @forges(READ)
 def an_action_without_its_hash(root, rng):
-    kept = (root / DECLARATION).read_text()
+    kept = (root / DECLARATION_FILE).read_text()
     edit(root, lambda rows: placed(rows, rng)["actions"].__setitem__(int(rng.integers(300)), 0.05))
-    (root / DECLARATION).write_text(kept)
+    (root / DECLARATION_FILE).write_text(kept)
 
 
 @forges(READ)
@@ -220,24 +222,24 @@ def a_success_beside_an_error(root, rng):
 
 @forges(READ)
 def a_truncated_file(root, rng):
-    content = (root / EPISODES).read_bytes()
-    (root / EPISODES).write_bytes(content[: int(rng.integers(len(content)))])
+    content = (root / EPISODES_FILE).read_bytes()
+    (root / EPISODES_FILE).write_bytes(content[: int(rng.integers(len(content)))])
     rehash(root)
 
 
 @forges(READ)
 def noise_in_the_file(root, rng):
     """As a fuzzer would: many bytes anywhere, and the hash made anew."""
-    content = np.frombuffer((root / EPISODES).read_bytes(), np.uint8).copy()
+    content = np.frombuffer((root / EPISODES_FILE).read_bytes(), np.uint8).copy()
     where = rng.integers(len(content) // 2, len(content), size=200)
     content[where] = rng.integers(256, size=len(where))
-    (root / EPISODES).write_bytes(content.tobytes())
+    (root / EPISODES_FILE).write_bytes(content.tobytes())
     rehash(root)
 
 
 @forges(READ)
 def another_column(root, rng):
-    schema = pq.read_schema(root / EPISODES)
+    schema = pq.read_schema(root / EPISODES_FILE)
     kind = rng.choice(["more", "less", "wider"])
     if kind == "more":
         schema = schema.append(pa.field("score", pa.float64()))
@@ -266,7 +268,7 @@ def a_bomb_of_text(root, rng):
 
 @forges(READ)
 def a_file_too_large(root, rng):
-    os.truncate(root / EPISODES, int(rng.integers(65 << 20, 1 << 40)))  # sparse
+    os.truncate(root / EPISODES_FILE, int(rng.integers(65 << 20, 1 << 40)))  # sparse
 
 
 @forges(READ)
@@ -299,7 +301,7 @@ def yaml_that_is_none(root, rng):
     text = rng.choice(
         ["[" * 60_000, "{" * 9000, "\x00", "9" * 9000, "? [a]\n: b", "- a", "", "a: b: c", "\ufeff\ud7ff"]
     )
-    (root / DECLARATION).write_text(str(text))
+    (root / DECLARATION_FILE).write_text(str(text))
 
 
 @forges(READ)
@@ -311,8 +313,8 @@ def a_key_twice(root, rng):
 def a_number_of_too_many_digits(root, rng):
     """Python refuses to print it, in a refusal for instance, and to turn it into a float."""
     number = rng.choice(["0x" + "f" * 5000, "1:" + "59:" * 15_000 + "59.5", "-0x" + "e" * 4000])
-    text = (root / DECLARATION).read_text()
-    (root / DECLARATION).write_text(text.replace("version: 1\n", f"version: {number}\n"))
+    text = (root / DECLARATION_FILE).read_text()
+    (root / DECLARATION_FILE).write_text(text.replace("version: 1\n", f"version: {number}\n"))
 
 
 @forges(READ)
@@ -322,7 +324,7 @@ def a_huge_declaration(root, rng):
 
 @forges(READ)
 def a_link(root, rng):
-    name = rng.choice([DECLARATION, EPISODES])
+    name = rng.choice([DECLARATION_FILE, EPISODES_FILE])
     target = rng.choice(["/etc/passwd", "/dev/zero", "missing"])
     (root / name).unlink()
     (root / name).symlink_to(target)
@@ -330,8 +332,8 @@ def a_link(root, rng):
 
 @forges(READ)
 def a_pipe(root, rng):
-    (root / EPISODES).unlink()
-    os.mkfifo(root / EPISODES)
+    (root / EPISODES_FILE).unlink()
+    os.mkfifo(root / EPISODES_FILE)
 
 
 @forges(READ)
@@ -341,7 +343,7 @@ def another_file(root, rng):
 
 @forges(READ)
 def a_missing_file(root, rng):
-    (root / rng.choice([DECLARATION, EPISODES])).unlink()
+    (root / rng.choice([DECLARATION_FILE, EPISODES_FILE])).unlink()
 
 
 @forges(READ)

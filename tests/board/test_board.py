@@ -15,16 +15,13 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from lerobot_constructskill.artifacts import processor
-from lerobot_constructskill.board import entries as entries_module
-from lerobot_constructskill.board import films
+from lerobot_constructskill.board import films, verification
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.exports import eval_info, write_exports
-from lerobot_constructskill.board.protocol import HORIZON, SUITES, Setting
+from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, BoardSetting
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.scripts.verify import _record
 
 BOARD = Path(__file__).parents[2] / "board"
 
@@ -55,14 +52,14 @@ def many(valid, tmp_path_factory):
             for seed in (0, 1)
         ),
     )
-    settings = {"block_to_bin": Setting("block_to_bin", episodes=2)}
+    settings = {"block_to_bin": BoardSetting("block_to_bin", episodes=2)}
     for name, seeds, placing in (("good", 10, 8), ("bad", 10, 0), ("few", 2, 2)):
         claims = []
         for seed in range(seeds):
             for one in good if seed < placing else bad:
-                actions = one.actions.copy()
+                actions = one.flat.copy()
                 actions[0] += seed * 1e-4
-                claims.append(Claim(**vars(one) | {"training_seed": seed, "actions": actions}))
+                claims.append(Claim(**vars(one) | {"training_seed": seed, "actions": [actions]}))
         if name == "bad":
             claims[0] = Claim(claims[0].evaluation_seed, setting="block_to_bin", error="<b>out of memory</b>")
         about = replace(said.about, name=f"<script>{name}</script>", observes="pixels")
@@ -77,7 +74,7 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
     pages = {path.stem: Page(path.read_text()) for path in write_board(BOARD, tmp_path, "alice/bench")}
     entries, _ = read_entries(BOARD)
     others = json.loads((tmp_path / "exports" / "leaderboard.json").read_text())
-    assert entries and pages.keys() == {"index", *SUITES}
+    assert entries and pages.keys() == {"index", *BOARD_SUITES}
     for entry in entries:
         assert entry.level == "replayed"
         assert entry.name in pages[entry.said.suite].found["id"]
@@ -150,17 +147,18 @@ def test_an_entry_that_is_being_written_is_not_read(many, tmp_path):
 
 def test_of_two_verdicts_at_once_none_is_lost(tmp_path, monkeypatch):
     """Both read before either writes, but for the lock."""
-    read, facts = entries_module.read_verdict, {"submission": "0" * 64, "level": "replayed", "versions": {}}
+    read = verification.read_verification
 
     def slowly(*of):
         verdict = read(*of)
         time.sleep(0.2)
         return verdict
 
-    monkeypatch.setattr(entries_module, "read_verdict", slowly)
-    monkeypatch.setattr(processor, "processor", lambda: threading.current_thread().name)
+    monkeypatch.setattr(verification, "read_verification", slowly)
+    monkeypatch.setattr(verification, "processor", lambda: threading.current_thread().name)
     path = tmp_path / "verified" / "entry.json"
-    threads = [threading.Thread(target=_record, args=(path, facts), name=name) for name in ("one", "two")]
+    record, facts = verification.record_verification, (path, "0" * 64, "replayed")
+    threads = [threading.Thread(target=record, args=facts, name=name) for name in ("one", "two")]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -226,8 +224,9 @@ def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
     rerun = replayed | {"level": "re-run", "rerun": {"value": "beef"}}
 
     def recorded(machine, facts):
-        monkeypatch.setattr(processor, "processor", lambda: machine)
-        _record(path, facts)
+        monkeypatch.setattr(verification, "processor", lambda: machine)
+        monkeypatch.setattr(verification, "deciding", lambda: facts["versions"] | {"processor": "a make"})
+        verification.record_verification(path, facts["submission"], facts["level"], facts.get("rerun"))
         return json.loads(path.read_text())
 
     assert recorded("A", replayed) == since | replayed | {"machines": ["A"]}
@@ -257,9 +256,8 @@ def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypa
     lengths = []
     monkeypatch.setattr(films, "open_simulator", lambda *_: Still())
     monkeypatch.setattr(films, "write_video", lambda path, frames, fps: lengths.append(len(frames)) or path.touch())
-    setting = Setting("brick_to_bin", episode_length=2 * HORIZON)
-    claim = Claim(0, steps=2 * HORIZON, actions=np.zeros(8 * HORIZON, np.float32))
-    films._film(setting, claim, tmp_path / "film.mp4")
+    claim = Claim(0, task="brick_to_bin", steps=2 * HORIZON, actions=[np.zeros(8 * HORIZON, np.float32)])
+    films._film(claim, tmp_path / "film.mp4")
     assert lengths == [HORIZON + 1] and (tmp_path / "film.mp4").exists()
 
 

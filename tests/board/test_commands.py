@@ -14,7 +14,7 @@ from torchcodec.decoders import VideoDecoder
 
 from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.board.protocol import FIRST_FRESH
-from lerobot_constructskill.board.submission import EPISODES, Claim, read_submission, write_submission
+from lerobot_constructskill.board.submission import EPISODES_FILE, Claim, read_submission, write_submission
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -86,9 +86,9 @@ def test_a_strangers_three_commands_and_a_rerun(tmp_path):
         assert (film.stat().st_mtime != 0) == made, "what is there is not made again"
         os.utime(film, (0, 0))
 
-    content = np.frombuffer((entry / EPISODES).read_bytes(), np.uint8).copy()
+    content = np.frombuffer((entry / EPISODES_FILE).read_bytes(), np.uint8).copy()
     content[len(content) // 2] ^= 1
-    (entry / EPISODES).write_bytes(content.tobytes())
+    (entry / EPISODES_FILE).write_bytes(content.tobytes())
     assert "its hash differs." in call("constructskill-verify", f"--root={entry}", fails=True)
 
 

@@ -7,7 +7,7 @@ import pytest
 from forge import READ, REPLAYED
 
 from lerobot_constructskill.board.replay import difference, open_simulator
-from lerobot_constructskill.board.submission import read_submission, width
+from lerobot_constructskill.board.submission import read_submission
 from lerobot_constructskill.errors import UserError
 
 COSTLY = ("a_bomb_of_rows", "a_bomb_of_actions", "a_bomb_of_text")
@@ -48,13 +48,13 @@ def test_what_is_wrong_with_it_is_seen_when_it_is_replayed(valid, tmp_path):
             submission = read_submission(forged(valid, tmp_path / kind, forge, number))
             changed = [claim for claim in submission.claims if is_other(claim, before.get(claim.key))]
             for claim in changed or submission.claims[:1]:
-                setting = submission.declaration.settings[claim.setting]
-                env = envs.setdefault(repr(setting), open_simulator(setting))
-                said = difference(env, claim, width(setting))
+                environment = claim.environment
+                env = envs.setdefault(repr(environment), open_simulator(environment))
+                said = difference(env, claim)
                 assert said and "\n" not in said, f"{kind} {number} passes"
     for env in envs.values():
         env.close()
 
 
 def is_other(one, other):
-    return other is None or one.outcome != other.outcome or not np.array_equal(one.actions, other.actions)
+    return other is None or one.outcome != other.outcome or not np.array_equal(one.flat, other.flat)

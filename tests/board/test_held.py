@@ -19,11 +19,11 @@ import pytest
 
 from lerobot_constructskill.artifacts.processor import make, processor
 from lerobot_constructskill.artifacts.revisions import revisions
-from lerobot_constructskill.board.submission import read_submission, width
+from lerobot_constructskill.board.submission import read_submission
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import Outcome
+from lerobot_constructskill.envs.recording import Episode
 
 pytestmark = pytest.mark.sim
 
@@ -50,19 +50,18 @@ def execute(task: str) -> tuple[dict, dict, bool]:
     """States and pictures of one of the expert's episodes, and whether it ends as the entry claims."""
     submission = read_submission(ENTRY)
     (claim,) = (one for one in submission.claims if (one.setting, one.evaluation_seed) == (task, START))
-    setting = submission.declaration.settings[task]
-    env = ConstructSkillEnv(task, "pixels_agent_pos", setting.episode_length, render_backend="cpu")
+    env = ConstructSkillEnv(task, "pixels_agent_pos", claim.episode_length, render_backend="cpu")
     env.reset(seed=START)
-    outcome, frames = Outcome(START), {}
-    for step, action in enumerate(claim.actions.reshape(-1, width(setting)), 1):
+    episode, frames = Episode(START), {}
+    for step, action in enumerate(claim.executed, 1):
         seen, *_, info = env.step(action)
-        outcome.count(info)
+        episode.add(action, info)
         if step in FRAMES:
             pictures = [seen["pixels"][name].tobytes() for name in OBS_TYPES["pixels_agent_pos"]]
             frames[str(step)] = hashlib.sha256(b"".join(pictures)).hexdigest()
     states = {name: env.privileged_state()[name].tolist() for name in ("object_pose", "tcp_pose", "fingers")}
     env.close()
-    return states, frames, outcome == claim.outcome
+    return states, frames, episode.outcome == claim.outcome
 
 
 def videos(root: Path) -> dict[str, str]:

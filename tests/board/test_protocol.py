@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lerobot_constructskill.board.declaration import OBSERVES, About
 from lerobot_constructskill.board.protocol import (
+    BOARD_SUITES,
     CONTROL,
     FIRST_FRESH,
     LEVEL,
@@ -14,14 +16,12 @@ from lerobot_constructskill.board.protocol import (
     PERTURBED_TASK,
     RANKED_FROM,
     RERUN_ALPHA,
-    SUITES,
     TRAINING_SEEDS,
-    Setting,
+    BoardSetting,
     class_of,
     fresh_settings,
     fresh_start,
 )
-from lerobot_constructskill.board.submission import OBSERVES, About
 from lerobot_constructskill.contract import DEMO_SEED_START, STAGES
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.perturbations import AXES
@@ -46,7 +46,7 @@ def rows_of_page() -> dict[str, dict[str, tuple[range, int]]]:
 def test_the_pages_table_is_the_protocol():
     assert rows_of_page() == {
         suite: {name: (one.starts, one.episode_length) for name, one in of.settings.items()}
-        for suite, of in SUITES.items()
+        for suite, of in BOARD_SUITES.items()
     }
 
 
@@ -63,23 +63,23 @@ def test_the_page_names_the_other_numbers():
 def test_the_pages_files_are_what_submit_reads():
     about, settings = re.search("```yaml\n# about.yaml\n(.*?)# settings.yaml\n(.*?)```", PAGE, re.DOTALL).groups()
     assert About(**yaml.safe_load(about)).observes in OBSERVES
-    assert [Setting(**one).task for one in yaml.safe_load(settings).values()] == ["brick_to_bin_turned"]
+    assert [BoardSetting(**one).task for one in yaml.safe_load(settings).values()] == ["brick_to_bin_turned"]
 
 
 def test_a_perturbed_setting_has_its_control():
-    settings = SUITES["perturbed"].settings
+    settings = BOARD_SUITES["perturbed"].settings
     assert settings.keys() == {CONTROL, *AXES}
     assert {one.perturbation for one in settings.values()} == {"", *(f"+{axis}={LEVEL}+seed=0" for axis in AXES)}
     assert len({(one.task, one.starts, one.episode_length) for one in settings.values()}) == 1
 
 
 def test_whoever_changes_a_setting_is_custom():
-    settings = SUITES["bins"].settings
+    settings = BOARD_SUITES["bins"].settings
     assert class_of("bins", dict(settings), [0, 3, 9]) == "standard"
     for changed in (
         {},
-        {**settings, "more": Setting("brick_to_bin")},
-        {**settings, "block_to_bin": Setting("brick_to_bin")},
+        {**settings, "more": BoardSetting("brick_to_bin")},
+        {**settings, "block_to_bin": BoardSetting("brick_to_bin")},
     ):
         assert class_of("bins", changed, TRAINING_SEEDS) == "custom"
     assert class_of("bins", dict(settings), [0, 3, 10]) == "custom", "chosen seeds"
@@ -88,13 +88,13 @@ def test_whoever_changes_a_setting_is_custom():
 @pytest.mark.parametrize("wrong", [{"task": "x"}, {"episodes": 0}, {"perturb": "rain=1"}, {"first_start": 2**31 - 5}])
 def test_what_is_no_setting_is_refused(wrong):
     with pytest.raises(InputError):
-        Setting(**{"task": "brick_to_bin", **wrong})
+        BoardSetting(**{"task": "brick_to_bin", **wrong})
 
 
 def test_fresh_starts_follow_from_both_values_and_meet_no_others():
     drawn = {fresh_start(sha, value) for sha in "ab" * 50 for value in map(str, range(100))}
     assert len(drawn) == 200 and min(drawn) >= FIRST_FRESH > DEMO_SEED_START
     assert fresh_start("a", " AB ") == fresh_start("a", "ab")
-    fresh = fresh_settings(SUITES["bins"].settings, max(drawn))
+    fresh = fresh_settings(BOARD_SUITES["bins"].settings, max(drawn))
     assert {one.first_start for one in fresh.values()} == {max(drawn)}
     assert [one.episodes for one in fresh.values()] == [1, 20, 20]

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from random_features import config, tiny_weights  # noqa: F401
 
-from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
+from lerobot_constructskill.envs.recording import RECORDINGS, Episode, deciding, write_recordings
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Row, write_rows
 
 ENV = {"task": "block_to_bin", "episode_length": 5, "obs_type": "pixels_agent_pos"}
@@ -64,10 +64,11 @@ def recorded(tmp_path):
     """Write recordings as $CONSTRUCTSKILL_RECORD does, or in one file; return a pattern of the folders."""
 
     def write(placed: Sequence[int], name: str = "recorded", whole: bool = False, **facts) -> str:
+        common = {"versions": json.dumps(deciding())} | ENV | facts
         for seed, count in enumerate(placed):
             folder = tmp_path / name / f"seed_{seed}"
             episodes = [
-                Recording(start, placed=i < count, actions=[np.full(4, seed + i, np.float32)], **(ENV | facts))
+                Episode(start, placed=i < count, actions=[np.full(4, seed + i, np.float32)], **common)
                 for i, start in enumerate(STARTS)
             ]
             if whole:

@@ -11,7 +11,7 @@ from lerobot_constructskill.comparison.match import Asked, MatchedSides, match
 from lerobot_constructskill.comparison.read import find, read_study
 from lerobot_constructskill.comparison.sides import Side, conditions
 from lerobot_constructskill.contract import TASKS
-from lerobot_constructskill.envs.recording import Recording
+from lerobot_constructskill.envs.recording import Episode
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
 from lerobot_constructskill.scripts import compare as script
 from lerobot_constructskill.scripts.compare import FAILED, CompareConfig, compare
@@ -153,7 +153,7 @@ def test_damaged_files_are_one_sentence(study, evaluated, recorded, tmp_path):
         with pytest.raises(InputError, match="is not what lerobot-eval writes"):
             compared(pattern, published, seed=1000)
     pattern = recorded(GOOD[:1])
-    Recording(1000, **ENV).write(next(tmp_path.glob("recorded/*")))
+    Episode(1000, **ENV).write(next(tmp_path.glob("recorded/*")))
     with pytest.raises(InputError, match="has two recordings of start 1000"):
         compared(pattern, published)
     next(tmp_path.glob("recorded/*/*.parquet")).write_bytes(b"no")

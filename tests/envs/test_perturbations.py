@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from lerobot_constructskill.board.protocol import Setting
+from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -78,7 +78,7 @@ def test_a_brick_too_large_for_its_bin_is_refused():
 
 @pytest.mark.parametrize("task", [name for name, task in TASKS.items() if not task.is_brick])
 def test_a_task_without_a_brick_has_no_brick_size(task):
-    for what in (ConstructSkillEnv, ConstructSkillEnvConfig, Setting):
+    for what in (ConstructSkillEnv, ConstructSkillEnvConfig, BoardSetting):
         with pytest.raises(UserError, match=f"EN 771-1.*{task} has no brick"):
             what(task=task, perturb="size=1")
         what(task=task, perturb="size=0,light=1")

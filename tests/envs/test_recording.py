@@ -9,7 +9,7 @@ from commands import call
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import FOLDER, Recording, read_recordings, recording_into, write_recordings
+from lerobot_constructskill.envs.recording import FOLDER, Episode, read_recordings, recording_into, write_recordings
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError
 
@@ -17,7 +17,7 @@ DOWN_OPEN = np.array([0.01, 0.02, -0.03, 1], dtype=np.float64)
 
 
 def test_recordings_are_read_as_they_were_written(tmp_path):
-    made = [Recording(7, lifted=True, stage="lifted", lift_step=2, task="brick_to_bin"), Recording(8)]
+    made = [Episode(7, lifted=True, stage="lifted", lift_step=2, task="brick_to_bin"), Episode(8)]
     made[0].add(
         np.float32([0.1, 0, -0.1, 1]), {"is_lifted": True, "is_in_bin": False, "is_success": False, "clipped_steps": 0}
     )
@@ -26,8 +26,8 @@ def test_recordings_are_read_as_they_were_written(tmp_path):
     for one, other in zip(made, read, strict=True):
         np.testing.assert_array_equal(one.flat, other.flat)
         assert vars(one) | {"actions": 0} == vars(other) | {"actions": 0}
-    old = pq.read_table(tmp_path / "some.parquet").drop_columns("clipped_steps")
-    pq.write_table(old, tmp_path / "old.parquet")
+    later = ["clipped_steps", "final_error_m"]
+    pq.write_table(pq.read_table(tmp_path / "some.parquet").drop_columns(later), tmp_path / "old.parquet")
     assert [one.clipped_steps for one in read_recordings(tmp_path / "old.parquet")] == [None, None]
     (tmp_path / "other.parquet").write_bytes(b"no parquet")
     with pytest.raises(InputError, match="cannot be read"):
@@ -35,11 +35,19 @@ def test_recordings_are_read_as_they_were_written(tmp_path):
 
 
 def test_an_array_that_its_caller_uses_again_is_recorded_as_it_was():
-    recording, action = Recording(7), np.zeros(4, np.float32)
+    recording, action = Episode(7), np.zeros(4, np.float32)
     for number in range(3):
         action[:] = number
         recording.add(action, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
     np.testing.assert_array_equal(recording.flat, np.repeat(np.float32([0, 1, 2]), 4))
+
+
+def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
+    episode, nothing = Episode(1000), {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0}
+    for info in ({}, {"is_lifted": True}, {"is_lifted": True, "is_in_bin": True}, {"is_lifted": True}):
+        episode.add(np.zeros(4), nothing | info)
+    assert (episode.stage, episode.lift_step, episode.place_step, episode.steps) == ("in_bin", 2, None, 4)
+    assert episode.lifted and not episode.placed
 
 
 @pytest.mark.sim

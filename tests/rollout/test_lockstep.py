@@ -14,8 +14,7 @@ from lerobot_constructskill.envs.configuration_constructskill import ConstructSk
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import native_precision
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.lockstep import Episode, roll_out
-from lerobot_constructskill.rollout.simulators import Step
+from lerobot_constructskill.rollout.lockstep import roll_out
 
 pytestmark = [pytest.mark.sim]
 
@@ -162,18 +161,4 @@ def test_a_failing_agent_is_recorded_and_the_others_go_on():
     assert fine.error is None
     assert [(e.evaluation_seed, e.steps, e.stage) for e in fine.episodes] == [(s, STEPS, "none") for s in SEEDS]
     assert [e.clipped_steps for e in fine.episodes] == [STEPS] * len(SEEDS), "it asks for 0.5 m a step"
-
-
-def step(**info):
-    state = {"object_pose": np.array([3, 4, 0, 1, 0, 0, 0]), "bin_position": np.zeros(3)}
-    return Step(
-        {}, state, False, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0} | info
-    )
-
-
-def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
-    episode = Episode(1000)
-    for info in ({}, {"is_lifted": True}, {"is_lifted": True, "is_in_bin": True}, {"is_lifted": True}):
-        episode.add(step(**info))
-    assert (episode.stage, episode.lift_step, episode.place_step, episode.steps) == ("in_bin", 2, None, 4)
-    assert episode.final_error_m == 5.0 and episode.lifted and not episode.placed
+    assert all(0 < e.final_error_m < 1 for e in fine.episodes)

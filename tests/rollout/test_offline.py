@@ -23,10 +23,10 @@ from lerobot_constructskill.rollout.offline import (
     Predictions,
     check_actions,
     observed,
+    observing_frames,
     offline_metrics,
     policy_errors,
     predict,
-    shown,
 )
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
@@ -323,10 +323,10 @@ def test_a_policy_is_not_compared_with_other_actions(config, feature_set, names,
 
 
 def test_an_observation_that_is_not_there_is_a_sentence(feature_set):
-    said = "reads observation.images.wrist; 'local/random' has observation.features"
-    with pytest.raises(ValueError, match=said), shown(feature_set):
+    said = "reads observation.images.wrist, which it is not shown: 'local/random' has observation.features"
+    with pytest.raises(ValueError, match=said), observing_frames(feature_set):
         raise KeyError("observation.images.wrist")
-    with pytest.raises(KeyError), shown(feature_set):
+    with pytest.raises(KeyError), observing_frames(feature_set):
         raise KeyError("a fault of ours")
 
 

@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 import yaml
 
-from lerobot_constructskill.board.collect import of_study, recorded_in, submit
-from lerobot_constructskill.board.protocol import Setting
-from lerobot_constructskill.board.submission import About
-from lerobot_constructskill.envs.recording import RECORDINGS, Recording, write_recordings
+from lerobot_constructskill.board.declaration import About
+from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit
+from lerobot_constructskill.board.protocol import BoardSetting
+from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.submit import SubmitConfig
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
 
-CONTROL = Setting("block_to_bin", episodes=2, episode_length=2, first_start=7)
+CONTROL = BoardSetting("block_to_bin", episodes=2, episode_length=2, first_start=7)
 SETTINGS = {"control": CONTROL, "block": replace(CONTROL, perturb="pose=1")}
 ABOUT = About(*["a test's"] * 7, observes="pixels")
 
 
 def recording(start, value=0.01, **facts):
     made = {"task": "block_to_bin", "episode_length": 2, "perturb": " pose=1", "backend": "physx_cpu, none rendering"}
-    one = Recording(start, **made | facts)
+    one = Episode(start, **made | facts)
     for _ in range(2):
         one.add(np.full(4, value), {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
     return one
@@ -55,7 +55,7 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("seed_00", "seed_0' and '.*seed_00' are of the same training seed"),
+        ("seed_00", "seed_00' is of no training seed"),
         ("seed_99999999999", "seed_99999999999' is of no training seed"),
         ("seed_one", "seed_one' is of no training seed"),
     ],
@@ -157,7 +157,7 @@ def test_a_studys_runs_become_a_submission(study, tmp_path):
     for elsewhere in ("brick", "long", "moved"):  # these are not asked for
         rows.append(Row(run="d3", **FACTS | {"setting": elsewhere}, error_kind=NOT_RUN))
     write_rows(rows, study / ROWS)
-    piles, failures = of_study(study, store, "ours", {"block": CONTROL})
+    piles, failures = recorded_by_study(study, store, "ours", {"block": CONTROL})
     assert {seed: len(pile) for seed, pile in piles.items()} == {0: 2, 1: 2, 2: 0} and failures == {2: "lost the plot"}
     assert len(made_of_study(tmp_path / "made", piles, failures).claims) == 6
 
@@ -173,24 +173,28 @@ def test_two_settings_of_a_study_that_evaluate_alike_are_never_mixed(study, tmp_
     write_rows(
         [failed, *(Row(run="d1", **FACTS | {"setting": "again", "episode": one}) for one in (0, 1))], study / ROWS
     )
-    with pytest.raises(InputError, match=r"block and again .* evaluate alike: .* --study_settings=\[again\]"):
-        of_study(study, store, "ours", {"block": CONTROL})
-    assert of_study(study, store, "ours", {"block": CONTROL}, ["block"])[1] == {0: "lost"}
-    piles, failures = of_study(study, store, "ours", {"block": CONTROL}, ["again"])
+    with pytest.raises(InputError, match=r"evaluate alike \(block, again\): .* --study_settings=\[again\]"):
+        recorded_by_study(study, store, "ours", {"block": CONTROL})
+    assert recorded_by_study(study, store, "ours", {"block": CONTROL}, ["block"])[1] == {0: "lost"}
+    piles, failures = recorded_by_study(study, store, "ours", {"block": CONTROL}, ["again"])
     assert len(piles[0]) == 2 and not failures
     with pytest.raises(InputError, match="has no setting 'nowhere'; it has: again, block"):
-        of_study(study, store, "ours", {"block": CONTROL}, ["nowhere"])
+        recorded_by_study(study, store, "ours", {"block": CONTROL}, ["nowhere"])
 
 
 def test_what_a_study_does_not_have_is_said(study, tmp_path):
     def collected(row, variant="ours", setting=CONTROL):
         write_rows([row], study / ROWS)
-        return of_study(study, tmp_path / "store", variant, {"one": setting})
+        return recorded_by_study(study, tmp_path / "store", variant, {"one": setting})
 
     row = Row(run="d9", **FACTS)
     with pytest.raises(InputError, match="it has: ours"):
         collected(row, "theirs")
-    for other in (Setting("tile_to_grid"), replace(CONTROL, episode_length=3), replace(CONTROL, perturb="pose=3")):
+    for other in (
+        BoardSetting("tile_to_grid"),
+        replace(CONTROL, episode_length=3),
+        replace(CONTROL, perturb="pose=3"),
+    ):
         with pytest.raises(InputError, match=r"in none of .*, but in block_to_bin \(2 steps\)"):
             collected(row, setting=other)
     with pytest.raises(MissingError, match="before actions were kept"):

@@ -1,0 +1,156 @@
+"""submission.yaml: what the author of a submission says of the policy, and where it was evaluated."""
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
+from lerobot_constructskill.bounds import UNSEEN, Among, NotEmpty, Pattern, Seed, check
+from lerobot_constructskill.contract import OBS_TYPES, TASKS, get_task
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.files import Yaml
+
+VERSION = 1
+
+MOST_EPISODES, MOST_SETTINGS, MOST_BYTES = 50_000, 32, 1 << 30
+"""Episodes and settings of a submission, and bytes of its actions unpacked."""
+
+LINE = Pattern(rf"(?=.*\S)[^{UNSEEN}]{{1,300}}", "one line of text, of at most 300 characters")
+NAME = Pattern("[a-z0-9][a-z0-9_]{0,39}", "a name of a-z, 0-9 and '_'")
+Line = Annotated[str, LINE]
+Link = Annotated[str, Pattern(r"https://[A-Za-z0-9./_~%#?=&:+-]{1,300}", "an address that begins with https://")]
+Hash = Annotated[str, Pattern("[0-9a-f]{64}", "a SHA-256 in hexadecimal digits")]
+
+OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
+"""What a policy sees: an `obs_type`, the simulator's own state (an expert), or nothing at all."""
+
+
+@dataclass(frozen=True)
+class About:
+    """What a submission must say of its policy.
+
+    Args:
+        name: what the board calls it.
+        submitter: who answers for it.
+        policy: its type, and its size where that matters.
+        revision: commit or hash by which its checkpoints are found.
+        data: what it was trained on, by name and revision; "none".
+        training: how, and how its training seeds were chosen.
+        compute: on what, and for how long.
+        observes: one of `OBSERVES`.
+        url: where its checkpoints are.
+        notes: what else a reader must know.
+
+    Raises:
+        InputError: a field is no line of text.
+    """
+
+    name: Line
+    submitter: Line
+    policy: Line
+    revision: Line
+    data: Line
+    training: Line
+    compute: Line
+    observes: Annotated[str, Among(OBSERVES)]
+    url: Link | None = None
+    notes: Line | None = None
+
+    def __post_init__(self):
+        check(self)
+
+    @property
+    def is_policy(self) -> bool:
+        """Whether it sees what a policy sees; what does not is a reference, a floor or a ceiling."""
+        return self.observes in OBS_TYPES
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """The content of submission.yaml.
+
+    Args:
+        about: the policy.
+        suite: a name in `protocol.BOARD_SUITES`.
+        settings: name to setting; those of the suite, or others.
+        training_seeds: of the runs that are in it.
+        backend: what simulated and rendered.
+        versions: packages that decide what an action does, and the make of the processor, each with its version.
+        episodes_sha256: hash of episodes.parquet.
+        version: of this format.
+
+    Raises:
+        InputError: a field has a value that it cannot have.
+    """
+
+    about: About
+    suite: Annotated[str, Among(tuple(BOARD_SUITES))]
+    settings: dict[str, BoardSetting]
+    training_seeds: Annotated[list[Seed], NotEmpty()]
+    backend: Line
+    versions: dict[Line, Line]
+    episodes_sha256: Hash
+    version: Annotated[int, Among((VERSION,))] = VERSION
+
+    def __post_init__(self):
+        check(self)
+        if not 1 <= len(self.settings) <= MOST_SETTINGS:
+            raise InputError(f"settings must be 1 to {MOST_SETTINGS}, not {len(self.settings)}.")
+        for name, setting in self.settings.items():
+            self._check_setting(name, setting)
+        if len(set(self.training_seeds)) < len(self.training_seeds):
+            raise InputError("training_seeds must differ.")
+        if self.episodes > MOST_EPISODES or self.most_bytes > MOST_BYTES:
+            raise InputError(
+                f"A submission has at most {MOST_EPISODES:,} episodes, and {MOST_BYTES:,} bytes of actions."
+            )
+
+    def _check_setting(self, name: str, setting: BoardSetting) -> None:
+        if not NAME.allows(name):
+            raise InputError(f"A setting's name must be {NAME.meaning}, not {name[:100]!a}.")
+        called = {task: (task, setting.perturbation) for task in TASKS}
+        called |= {one: (of.task, of.perturbation) for one, of in BOARD_SUITES[self.suite].settings.items()}
+        own = setting.task, setting.perturbation
+        if own != (meant := called.get(name, own)):
+            raise InputError(f"The setting {name} must be of the task {''.join(meant)}, or have another name than it.")
+        control = replace(setting, perturb="", perturb_seed=0).compared
+        if control not in [one.compared for one in self.settings.values()]:
+            raise InputError(
+                f"The setting {name} must have its control beside it: a setting of the same task, length and starts "
+                "without a perturbation."
+            )
+
+    @property
+    def settings_class(self) -> str:
+        return class_of(self.suite, self.settings, self.training_seeds)
+
+    @property
+    def is_replayable(self) -> bool:
+        """Whether it was made with the physics that a replay has."""
+        return self.backend.split(",")[0] == PHYSICS
+
+    @property
+    def episodes(self) -> int:
+        return len(self.training_seeds) * sum(setting.episodes for setting in self.settings.values())
+
+    @property
+    def most_bytes(self) -> int:
+        """Bytes of all actions, unpacked, if every episode ran to its end."""
+        return len(self.training_seeds) * sum(
+            4 * len(get_task(setting.task).action_names) * setting.episodes * setting.episode_length
+            for setting in self.settings.values()
+        )
+
+    @property
+    def keys(self) -> set[tuple[str, int, int]]:
+        """Setting, training seed and evaluation seed of every episode that is to be there."""
+        return {
+            (name, seed, start)
+            for name, setting in self.settings.items()
+            for seed in self.training_seeds
+            for start in setting.starts
+        }
+
+
+ABOUT = Yaml("what is said of a policy", About)
+SETTINGS = Yaml("a list of settings", dict[str, BoardSetting])
+DECLARED = Yaml("the declaration of a submission", Declaration)

@@ -1,0 +1,174 @@
+"""Makes a submission from recorded episodes: of a study's runs, or of folders that `$CONSTRUCTSKILL_RECORD` named."""
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from lerobot_constructskill.board.declaration import About
+from lerobot_constructskill.board.protocol import BoardSetting, where
+from lerobot_constructskill.board.submission import Claim, Submission, write_submission
+from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_environments, read_rows
+
+type Recorded = dict[int, list[Episode]]
+"""Training seed to the episodes of its policy."""
+
+type Failures = dict[int, str]
+"""Training seed to why its run never finished."""
+
+
+def recorded_in(root: Path) -> Recorded:
+    """Read a folder that has a folder of recordings for each training seed: `seed_0`, `seed_1`, ...
+
+    Raises:
+        MissingError: there is no such folder.
+        InputError: a file in one is no recording, or a folder is no training seed's.
+    """
+    recorded = {}
+    for folder in sorted(root.glob("seed_*")):
+        if (found := re.fullmatch("seed_(0|[1-9][0-9]{0,8})", folder.name)) is None:
+            raise InputError(f"'{folder}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        # A name that begins with a dot is of a file that was never finished.
+        files = sorted(folder.rglob("[!.]*.parquet", case_sensitive=False))
+        recorded[int(found[1])] = [episode for file in files for episode in read_recordings(file)]
+    if not recorded:
+        raise MissingError(f"'{root}' has no folder seed_0, seed_1, ... of recordings.")
+    return recorded
+
+
+def recorded_by_study(
+    root: Path,
+    store: Path,
+    variant: str,
+    settings: Mapping[str, BoardSetting],
+    chosen: Sequence[str] | None = None,
+) -> tuple[Recorded, Failures]:
+    """Read what a variant's runs executed where a submission's `settings` are evaluated, and why some failed.
+
+    Args:
+        chosen: the study's settings whose runs are meant, where several evaluate alike; all by default.
+
+    Raises:
+        MissingError: the study, or what one of its runs executed, is not there.
+        InputError: the study has no such variant, or not where one of the settings is, or twice there.
+    """
+    check_folder(root)
+    rows = read_rows(root / ROWS)
+    own = rows[rows["variant"] == variant].fillna({"error_kind": "", "error": ""})
+    if own.empty:
+        raise InputError(f"The study has no variant '{variant}'; it has: {', '.join(rows['variant'].unique())}.")
+    own = own[own["setting"].isin(_alike(root, own["setting"].unique(), settings, chosen))]
+    recorded: Recorded = {int(seed): [] for seed in own["training_seed"]}
+    failures: Failures = {}
+    for row in own.drop_duplicates(["setting", "training_seed"]).itertuples():
+        path = store / "runs" / str(row.run) / RECORDINGS
+        if row.error_kind == NOT_RUN:
+            raise MissingError(f"The study has not run {row.setting}/{variant}/seed_{row.training_seed} yet.")
+        if row.error_kind:
+            failures[int(row.training_seed)] = " ".join(row.error.split())[:300]
+        elif not path.is_file():
+            raise MissingError(
+                f"'{path}' is missing: give the store in which the run was made; runs from before actions were kept "
+                "cannot be replayed."
+            )
+        else:
+            recorded[int(row.training_seed)] += read_recordings(path)
+    return recorded, failures
+
+
+def _alike(
+    root: Path, ran: Iterable[str], settings: Mapping[str, BoardSetting], chosen: Sequence[str] | None
+) -> list[str]:
+    """Those settings of a study that a variant `ran` in and that evaluate as one of `settings` does."""
+    places = {
+        name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
+        for name, env in read_environments(root).items()
+    }
+    if unknown := [name for name in chosen or () if name not in places]:
+        raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(places)}.")
+    asked = [where(**setting.environment) for setting in settings.values()]
+    ran = {name: places[name] for name in ran if name in (chosen or places)}
+    alike = {name: place for name, place in ran.items() if place in asked}
+    if not alike:
+        raise InputError(f"It was evaluated in none of {_told(asked)}, but in {_told(ran.values())}.")
+    one_of_each = {place: name for name, place in alike.items()}
+    if len(one_of_each) < len(alike):
+        raise InputError(
+            f"Some settings of the study evaluate alike ({', '.join(alike)}): say whose runs are meant, such as "
+            f"--study_settings=[{','.join(one_of_each.values())}]."
+        )
+    return list(alike)
+
+
+def _told(places: Iterable[tuple[str, int, str]]) -> str:
+    return ", ".join(f"{task}{label} ({length} steps)" for task, length, label in dict.fromkeys(places))
+
+
+def submit(
+    root: Path,
+    about: About,
+    suite: str,
+    settings: Mapping[str, BoardSetting],
+    recorded: Recorded,
+    failures: Failures,
+) -> Submission:
+    """Write a submission of what was recorded.
+
+    Args:
+        failures: training seeds whose missing episodes failed, and why; they stay in the denominator.
+
+    Raises:
+        TakenError: `root` exists.
+        InputError: an episode is missing or was recorded twice, or they do not belong together.
+    """
+    seeds = sorted(recorded.keys() | failures.keys())
+    claims = []
+    for seed in seeds:
+        for name, setting in settings.items():
+            place = where(**setting.environment)
+            there = [one for one in recorded.get(seed, []) if where(**one.environment) == place]
+            for start in setting.starts:
+                found = [one for one in there if one.evaluation_seed == start]
+                missing = Claim(start, setting=name, training_seed=seed, error=failures.get(seed))
+                claims.append(_claim(found, missing, setting))
+    ended = [claim for claim in claims if claim.error is None]
+    if not ended:
+        raise InputError("Nothing was recorded.")
+    if about.observes == "pixels_agent_pos" and "pixels" in {claim.obs_type for claim in ended}:
+        raise InputError(
+            "about.observes is pixels_agent_pos, but the policy was shown pixels: it can observe no more."
+        )
+    return write_submission(
+        root,
+        claims,
+        about=about,
+        suite=suite,
+        settings=dict(settings),
+        training_seeds=seeds,
+        backend=_only({claim.backend for claim in ended}, "backends"),
+        versions=json.loads(_only({claim.versions for claim in ended}, "versions of packages or makes of processors")),
+    )
+
+
+def _claim(found: Sequence[Episode], missing: Claim, setting: BoardSetting) -> Claim:
+    """The claim of an episode that was recorded, or `missing`, which says why it was not."""
+    if len({one.flat.tobytes() for one in found}) > 1:
+        raise InputError(f"{missing.label} was recorded twice, with different actions; record into an empty folder.")
+    if found:
+        return Claim(**vars(found[0]), setting=missing.setting, training_seed=missing.training_seed)
+    if missing.error is None:
+        raise InputError(
+            f"{missing.label} was not recorded (task {setting.task}, {setting.episode_length} steps); evaluate it, or "
+            f"say in --failures why training seed {missing.training_seed} failed."
+        )
+    return missing
+
+
+def _only(different: set[str], what: str) -> str:
+    if len(different) > 1:
+        raise InputError(
+            f"The episodes were recorded with several {what}: {' and '.join(sorted(different))}; record them with one."
+        )
+    return different.pop()
