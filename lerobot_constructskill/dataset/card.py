@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_values
+from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_fields
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
 from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
@@ -66,7 +66,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     Raises:
         InputError: the data set says of itself what none can.
     """
-    check_values(Provenance, data.facts, f"{SIDECAR}: ")
+    check_fields(Provenance, data.facts, f"{SIDECAR}: ")
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from lerobot_constructskill.bounds import check_values as check_fields
+from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     DEMO_SEED_START,
