@@ -149,7 +149,7 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
 def check_same(made: Any, given: Any, name: str = "", kind: Any = Any) -> None:
     """Refuse plain values that draccus has turned into others: true into 1, 1.10 into "1.1", [] into all defaults.
 
-    A value of the default's type is right whatever the annotation says: LeRobot annotates some truth values as numbers.
+    A value of the default's type is right whatever the annotation says: LeRobot annotates some truth values as int.
 
     Args:
         made: what draccus made.
