@@ -132,6 +132,13 @@ RepoId = Annotated[str, Pattern(rf"{_WORD}/{_WORD}", "user/name, each of letters
 Device = Annotated[str, Present()]
 
 
+class Checked:
+    """Base of a dataclass that is checked when it is made. Raises as `check` does."""
+
+    def __post_init__(self):
+        check(self)
+
+
 def check(config: Any, of: str = "") -> None:
     """Refuse a dataclass that has a field whose value its annotation does not allow.
 

@@ -22,8 +22,8 @@ from lerobot_constructskill.scripts import console
 from lerobot_constructskill.scripts.film import FilmConfig
 
 SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
-BARE = {"constructskill-doctor", "constructskill-config"}
-"""Commands without a configuration."""
+BARE = {"constructskill-doctor"}
+"""The command without a configuration."""
 
 NEEDED = {
     "repo_id": "alice/set",

@@ -1,4 +1,4 @@
-"""What a policy's card says beyond LeRobot's: outcomes per training seed, the data set's revision, the backbone."""
+"""A policy's card on the Hub: outcomes per training seed, the data set's revision, and the backbone."""
 
 from pathlib import Path
 from typing import Any
@@ -31,17 +31,17 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     return sorted(outcomes)
 
 
-def render_outcomes(
-    outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
+def render_card(
+    repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
 ) -> str:
-    """The section, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
-    backbone = {name: policy.get(f"backbone_{name}") for name in ("source", "sha256", "precision")}
+    """The card of a policy, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
     return markdown.render(
         "policy_card.md.j2",
+        repo_id=repo_id,
         outcomes=outcomes,
         task=task,
         this_seed=train.get("seed"),
         dataset=train.get("dataset", {}).get("repo_id"),
         revision=train.get("dataset", {}).get("revision"),
-        backbone=backbone | {"name": policy["backbone"]} if "backbone" in policy else None,
+        policy=policy,
     )
