@@ -14,9 +14,8 @@ from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import obtain_round, totals
 from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
-from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
-from lerobot_constructskill.demos.modality import write_meanings
+from lerobot_constructskill.demos.metadata import file_hashes, write_meanings
 from lerobot_constructskill.demos.obtain import obtain_demonstrations
 from lerobot_constructskill.progress import quiet
 

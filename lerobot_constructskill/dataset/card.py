@@ -13,8 +13,15 @@ from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.interface import describe_task
 
-Version = Annotated[str, Pattern(r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}(?:, edited: [\w./, -]{1,999})?|[\w.+!-]{1,64}", "a version")]
-"""Of a package, and of one whose source is told as well (`artifacts/code.py`)."""
+Version = Annotated[
+    str,
+    Pattern(
+        r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}(?:, edited: [\w./, -]{1,999})?|[\w.+!-]{1,64}",
+        "a version",
+    ),
+]
+"""The version of a package, or what `artifacts/code.py` says of one whose source is hashed."""
+
 
 MEANINGS = {
     "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",

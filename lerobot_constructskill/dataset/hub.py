@@ -1,7 +1,6 @@
 """Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
 
 import logging
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from math import ceil
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 from lerobot_constructskill.artifacts.digests import data_sha256, files_below
 from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
 from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
-from lerobot_constructskill.dataset.frames import packet_times
+from lerobot_constructskill.dataset.frames import video_complaints
 from lerobot_constructskill.errors import (
     InputError,
     MachineError,
@@ -39,8 +38,8 @@ PUSHED = [
 ]
 """What leaves the machine; `*` stands for folders as well."""
 
-SAME_RATE = 0.01
-"""Share by which a video's rate may differ from the data set's."""
+SET_FOLDERS = ("data/", "videos/", "meta/")
+"""Folders whose files are deleted on the Hub where the pushed set lacks them."""
 
 UNTOUCHED = {".gitattributes"}
 """What the Hub itself puts into a new repository."""
@@ -134,15 +133,8 @@ def _check_videos(dataset: "LeRobotDataset") -> None:
             path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], camera)
             rows[path] = rows.get(path, 0) + episode["length"]
     for path, wanted in rows.items():
-        name = path.relative_to(dataset.root)
-        times = packet_times(path, name)
-        if len(times) < wanted:
-            raise InputError(f"{name} has {len(times)} frames, but its episodes have {wanted}.")
-        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else dataset.fps
-        if abs(rate - dataset.fps) > SAME_RATE * rate:
-            raise InputError(
-                f"{INFO} says {dataset.fps} frames a second, but {name} has {rate:.4g}: put back the fps that it had."
-            )
+        for complaint in video_complaints(path, path.relative_to(dataset.root), wanted, dataset.fps):
+            raise InputError(complaint)
 
 
 def choose_held_out(
@@ -233,54 +225,53 @@ def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
 
 
 def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
+    """What an error of the Hub's client means; None for other errors."""
     import httpx
     from huggingface_hub import errors
 
-    if isinstance(error, errors.RevisionNotFoundError):
-        return f"'{repo_id}' has no revision '{revision}' on the Hub."
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
-    if isinstance(error, errors.LocalEntryNotFoundError):
-        of = f"revision '{revision}' of " if revision else ""
-        return f"The Hub cannot be reached and {of}'{repo_id}' is not in the cache."
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
-    if isinstance(error, errors.HfHubHTTPError):
-        return _refusal(repo_id, error.response.status_code)
-    if isinstance(error, errors.HFValidationError):
-        return f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."
-    if isinstance(error, httpx.ConnectError):
-        return f"The Hub cannot be reached for '{repo_id}'."
-    if isinstance(error, httpx.HTTPError):
-        return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
-    return None
-
-
-def _refusal(repo_id: str, status: int | None) -> str:
-    if status == 401:
-        return f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"
-    if status == 403:
-        return (
-            f"The token of this machine may not write to '{repo_id}', or not read it: ask for access, or name another."
-        )
-    return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."
+    of = f"revision '{revision}' of " if revision else ""
+    status = error.response.status_code if isinstance(error, errors.HfHubHTTPError) else None
+    reasons = (  # the first whose class and status fit
+        (errors.RevisionNotFoundError, status, f"'{repo_id}' has no revision '{revision}' on the Hub."),
+        (
+            errors.RepositoryNotFoundError,
+            status,
+            f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}",
+        ),
+        (errors.LocalEntryNotFoundError, None, f"The Hub cannot be reached and {of}'{repo_id}' is not in the cache."),
+        (errors.OfflineModeIsEnabled, None, f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."),
+        (errors.HfHubHTTPError, 401, f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"),
+        (
+            errors.HfHubHTTPError,
+            403,
+            f"The token of this machine may not write to '{repo_id}', or not read it: ask for access or name another.",
+        ),
+        (errors.HfHubHTTPError, status, f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."),
+        (errors.HFValidationError, None, f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."),
+        (httpx.ConnectError, None, f"The Hub cannot be reached for '{repo_id}'."),
+        (
+            httpx.HTTPError,
+            None,
+            f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues.",
+        ),
+    )
+    return next((said for kind, code, said in reasons if isinstance(error, kind) and status == code), None)
 
 
 def check_private(repo_id: str, repo_type: str = "model") -> None:
-    """Refuse a repository that is there and public: the Hub makes new ones private alone.
+    """Refuse a repository that is public: the Hub makes only new ones private.
 
     Raises:
         InputError: it is public.
     """
     from huggingface_hub import HfApi
 
-    api, repo = HfApi(), {"repo_id": repo_id, "repo_type": repo_type}
-    if api.repo_exists(**repo) and not api.repo_info(**repo).private:
+    if not HfApi().repo_info(repo_id, repo_type=repo_type).private:
         raise InputError(f"'{repo_id}' is on the Hub already and public: make it private there, or name another.")
 
 
 def _is_cut(root: Path, **repo: str) -> bool:
-    """Whether a repository without LeRobot's tag holds nothing but the set in `root`, whose push was interrupted."""
+    """Whether a repository without LeRobot's tag is empty or holds an interrupted push of the set in `root`."""
     from huggingface_hub import HfApi
 
     api = HfApi()
@@ -288,17 +279,6 @@ def _is_cut(root: Path, **repo: str) -> bool:
     if INFO not in held:
         return not held
     return Path(api.hf_hub_download(**repo, filename=INFO)).read_bytes() == (root / INFO).read_bytes()
-
-
-@contextmanager
-def _without_linked_folders(root: Path) -> Iterator[Path]:
-    """Yield a folder of links to all files of `root`: the Hub's client does not look into a folder that is a link."""
-    with tempfile.TemporaryDirectory() as folder:
-        for path in files_below(root, ""):
-            link = Path(folder) / path.relative_to(root)
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(path.resolve())
-        yield Path(folder)
 
 
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
@@ -316,7 +296,8 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         InputError: it is public, and `private` is set.
         OSError: the Hub cannot be reached, or refuses the token or the name.
     """
-    from huggingface_hub import HfApi
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+    from huggingface_hub.utils import filter_repo_objects
     from lerobot.datasets import CODEBASE_VERSION
 
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
@@ -327,9 +308,15 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
         if not update and (CODEBASE_VERSION in tagged or not _is_cut(root, **repo)):
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
-        stale = ["data/*", "videos/*", "meta/*"]
-        with _without_linked_folders(root) as folder:
-            commit = api.upload_folder(**repo, folder_path=folder, allow_patterns=PUSHED, delete_patterns=stale)
+        # `upload_folder` does not look into a folder that is a link.
+        names = sorted(path.relative_to(root).as_posix() for path in files_below(root, ""))
+        pushed = list(filter_repo_objects(names, allow_patterns=PUSHED))
+        held = {name for name in api.list_repo_files(**repo) if name.startswith(SET_FOLDERS)}
+        operations = [
+            *(CommitOperationAdd(name, root / name) for name in pushed),
+            *map(CommitOperationDelete, held - set(pushed)),
+        ]
+        commit = api.create_commit(**repo, operations=operations, commit_message="Upload a data set")
         for name in dict.fromkeys(filter(None, (tag, CODEBASE_VERSION))):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)

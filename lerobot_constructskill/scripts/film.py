@@ -6,10 +6,24 @@ from typing import Annotated
 
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
+from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.parsing import tells_of_bases
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.scripts.console import run
-from lerobot_constructskill.scripts.no_noise import NoNoise
+
+
+@tells_of_bases
+@dataclass(frozen=True)
+class NoNoise(NoiseConfig):
+    """`NoiseConfig` for commands that add no noise by default; draccus takes no default from a field's value.
+
+    Args:
+        sigma: standard deviation per axis of `fixed`, in metres; none by default.
+    """
+
+    sigma: Sigma = 0.0
+
 
 View = Annotated[str, Among(("close", "policy"))]
 
@@ -66,7 +80,3 @@ def film(config: FilmConfig) -> str:
 
 def main() -> None:
     run(FilmConfig, film)
-
-
-if __name__ == "__main__":
-    main()

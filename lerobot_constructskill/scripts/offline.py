@@ -9,7 +9,7 @@ from typing import Annotated
 from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced, write_text
 from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
-from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
+from lerobot_constructskill.bounds import BatchSize, Checked, Device, Episodes, NotEmpty, RepoId, Seed, Text
 from lerobot_constructskill.errors import MissingError, plural
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
@@ -18,7 +18,7 @@ Patterns = Annotated[list[Text], NotEmpty()]
 
 
 @dataclass
-class OfflineConfig:
+class OfflineConfig(Checked):
     """Print and write a table of translation errors in metres, gripper accuracy and chunk consistency."""
 
     policies: Patterns  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
@@ -31,9 +31,6 @@ class OfflineConfig:
     seed: Seed = 0  # of policies that sample their actions
     device: Device | None = None  # default: that of the checkpoint
     backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's
-
-    def __post_init__(self):
-        check(self)
 
 
 SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
@@ -130,7 +127,3 @@ def _write(rows: list[dict], folder: Path) -> str:
 
 def main() -> None:
     run(OfflineConfig, evaluate_offline)
-
-
-if __name__ == "__main__":
-    main()

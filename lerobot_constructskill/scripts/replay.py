@@ -3,22 +3,19 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import Episodes, RepoId, Text, check
+from lerobot_constructskill.bounds import Checked, Episodes, RepoId, Text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run, say
 
 
 @dataclass
-class ReplayConfig:
+class ReplayConfig(Checked):
     """Replay a data set in the simulator; exit status 1 if an outcome differs."""
 
     repo_id: RepoId | None = None  # its name; downloaded from the Hub unless root is given
     root: Path | None = None  # its folder
     revision: Text | None = None  # tag, branch or commit on the Hub
     episodes: Episodes | None = None  # which to replay; default: all
-
-    def __post_init__(self):
-        check(self)
 
 
 def replay_all(config: ReplayConfig) -> str:
@@ -55,7 +52,3 @@ def replay_all(config: ReplayConfig) -> str:
 
 def main() -> None:
     run(ReplayConfig, replay_all)
-
-
-if __name__ == "__main__":
-    main()

@@ -14,7 +14,7 @@ from hub_server import TOKENS, serve
 
 from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.dataset.hub import pull, push
-from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.errors import InputError, TakenError
 from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
