@@ -12,7 +12,7 @@ import yaml
 from lerobot_constructskill import files
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_text
-from lerobot_constructskill.presets import named
+from lerobot_constructskill.presets import find
 
 
 class Loader(files.Loader):
@@ -29,7 +29,7 @@ def _policy(loader: Loader, node: yaml.Node) -> dict[str, Any]:
         if "preset" not in fields:
             raise InputError("`!policy {…}` must name the policy that it starts from, such as `preset: precise`.")
         name = fields.pop("preset")
-    return read(named("policy", str(name))) | fields
+    return read(find("policy", str(name), or_file=False)) | fields
 
 
 Loader.add_constructor("!policy", _policy)

@@ -43,7 +43,6 @@ ARROWS = {
     "demos.obtain": ("artifacts", "envs"),
     "demos.shards": ("artifacts", "contract", "envs"),
     "dataset": ("artifacts", "contract", "demos", "interface", "parsing"),
-    "dataset.replay": ("contract", "demos", "envs"),
     "features": ("artifacts", "cameras", "contract", "policies", "policy_types"),
     "rollout": ("contract",),
     "rollout.agents": ("contract", "policy_types"),

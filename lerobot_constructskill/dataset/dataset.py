@@ -1,4 +1,4 @@
-"""A finished data set as plain tables, read from its files alone: whoever checks LeRobot's work cannot ask LeRobot."""
+"""Reads a finished data set as plain tables from its files, without LeRobot, whose work the tables serve to check."""
 
 import re
 from dataclasses import dataclass
@@ -162,12 +162,10 @@ def open_dataset(root: Path) -> DataSet:
     if data.rows.empty:
         raise InputError("data/ holds no frames.")
     of_videos = [f"videos/{camera}/{name}" for camera in data.cameras for name in VIDEO_COLUMNS]
-    missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
-    if missing:
-        raise InputError(f"meta/episodes/ has no column {missing[0]}.")
     for name in (*EPISODE_COLUMNS, *of_videos):
-        if data.episodes[name].dtype.kind not in "if" or not np.isfinite(data.episodes[name]).all():
-            raise InputError(f"{name} in meta/episodes/ must be a number in every row.")
+        values = data.episodes.get(name)
+        if values is None or values.dtype.kind not in "if" or not np.isfinite(values).all():
+            raise InputError(f"meta/episodes/ must have {name}, a number in every row.")
     return data
 
 

@@ -3,10 +3,16 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from lerobot_constructskill.bounds import Checked, Count
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, get_task
-from lerobot_constructskill.demos.expert import ExpertConfig
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.scripts.film import NoNoise
 
@@ -50,11 +56,6 @@ def check_task(config: CheckTaskConfig) -> str:
 
 def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
     """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
-    from lerobot_constructskill.demos.demonstrate import demonstrate
-    from lerobot_constructskill.demos.expert import make_expert
-    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-    from lerobot_constructskill.progress import Progress
-
     expert = make_expert(get_task(config.task), config.expert)
     env = ConstructSkillEnv(config.task, render_backend="none")
     lengths, failures = [], []
@@ -70,13 +71,6 @@ def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
 
 def save_contact_sheet(config: CheckTaskConfig) -> Path:
     """Save what both cameras show at the start of each phase and at the end, and return the picture's path."""
-    import numpy as np
-    from PIL import Image
-
-    from lerobot_constructskill.demos.demonstrate import demonstrate
-    from lerobot_constructskill.demos.expert import make_expert
-    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-
     expert = make_expert(get_task(config.task), config.expert)
     env = ConstructSkillEnv(config.task, "pixels_agent_pos")
     frames, _ = demonstrate(env, expert, NoNoise(), DEMO_SEED_START)

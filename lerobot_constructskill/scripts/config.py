@@ -4,16 +4,12 @@ import os
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from lerobot_constructskill.bounds import Checked, Count, RepoId, Text
 from lerobot_constructskill.errors import InputError, MissingError, TakenError, plural
 from lerobot_constructskill.files import read_bytes
 from lerobot_constructskill.presets import KINDS, description, find, names
 from lerobot_constructskill.scripts.console import run
-
-if TYPE_CHECKING:
-    from lerobot_constructskill.dataset.split import Split
 
 TRAIN = "train/"
 
@@ -84,28 +80,16 @@ def write(config: ConfigConfig) -> Path:
     )
     if file.exists() and not read_bytes(file).startswith(f"# {TRAIN}".encode()):
         raise TakenError(f"{file} exists and was not written by constructskill-config: name another with --out.")
-    fields = fill(template, source, split, passes)
+    steps = passes * ceil(split.frames / template["batch_size"])  # the last batch of a pass may be smaller
+    # Only as many checkpoints as have equally many whole passes between them, so that the last is of the last step.
+    often = steps // max(n for n in range(1, template["checkpoints"] + 1) if passes % n == 0)
+    fields = {
+        "dataset": {**source, "episodes": split.episodes, "eval_split": split.eval_split},
+        **{name: value for name, value in template.items() if name not in ("passes", "checkpoints")},
+        **{"steps": steps, "save_freq": often, "eval_steps": often if split.n_held_out else 0},
+    }
     write_text(file, text + yaml.safe_dump(fields, sort_keys=False, default_flow_style=None, width=119))
     return file
-
-
-def fill(template: dict[str, Any], source: dict[str, str], split: "Split", passes: int) -> dict[str, Any]:
-    """The fields of `lerobot-train` for a data set.
-
-    Args:
-        template: a file of `configs/train`: fields of `lerobot-train`, and `passes` and `checkpoints`.
-        source: `repo_id` of the data set, and its `root` if it is a folder.
-        split: what is held out of it.
-        passes: how often each frame is trained on; the last batch of a pass may be smaller.
-    """
-    fields = {name: value for name, value in template.items() if name not in ("passes", "checkpoints")}
-    steps = passes * ceil(split.frames / fields["batch_size"])
-    # Only as many checkpoints as have equally many whole passes between them, so that the last is of the last step.
-    checkpoints = max(n for n in range(1, template["checkpoints"] + 1) if passes % n == 0)
-    often = steps // checkpoints
-    dataset = {**source, "episodes": split.episodes, "eval_split": split.eval_split}
-    when = {"steps": steps, "save_freq": often, "eval_steps": often if split.n_held_out else 0}
-    return {"dataset": dataset, **fields, **when}
 
 
 def show_or_write(config: ConfigConfig) -> str:

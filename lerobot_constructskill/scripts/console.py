@@ -1,4 +1,4 @@
-"""The edge of the console commands: a configuration from flags and YAML, and whatever goes wrong as one sentence."""
+"""Runs a console command: a configuration from flags and YAML, and one sentence for whatever goes wrong."""
 
 import argparse
 import logging
@@ -52,39 +52,26 @@ def run[Config](
     with edge():
         from lerobot_constructskill.parsing import parse
 
-        flags, epilog = _put_names(sys.argv[1:], first), EPILOG
-        if presets:
-            flags, epilog = _put_file(flags, presets), f"{_tell_names(presets)} {EPILOG}"
-        say(action(parse(config_class, flags, epilog=epilog)))
+        shipped = ", ".join(names(presets)) if presets else ""
+        told = f"Instead of --config_path, the first argument can be a file or a name: {shipped}. "
+        flags = _put_names(sys.argv[1:], ("config_path",) if presets else first, presets)
+        say(action(parse(config_class, flags, epilog=(told if presets else "") + EPILOG)))
 
 
-def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
-    """Put the names of fields before values that come before all flags."""
+def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> list[str]:
+    """Put the names of fields before values that come before all flags; of `presets` a value is a name or a file."""
     values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
     if len(values) > len(first):
         raise InputError(
             f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
             "marks, so that the shell leaves it alone."
         )
-    others = flags[len(values) :]
+    named, others = [], flags[len(values) :]
     for name, value in zip(first, values, strict=False):
         if any(flag.split("=")[0] == f"--{name}" for flag in others):
             raise InputError(f"'{value}' and --{name} are two values of one field; give only one.")
-    return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *others]
-
-
-def _put_file(flags: list[str], kind: str) -> list[str]:
-    """Replace a name or file that comes before all flags by `--config_path`."""
-    if not flags or flags[0].startswith("-"):
-        return flags
-    name, *others = flags
-    if any(flag.split("=")[0] == "--config_path" for flag in others):
-        raise InputError(f"'{name}' and --config_path are two configurations; give only one.")
-    return [f"--config_path={find(kind, name)}", *others]
-
-
-def _tell_names(kind: str) -> str:
-    return f"Instead of --config_path, the first argument can be a file or a name: {', '.join(names(kind))}."
+        named.append(f"--{name}={find(presets, value) if presets else value}")
+    return [*named, *others]
 
 
 @contextmanager

@@ -4,12 +4,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.bounds import Among, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.parsing import tells_of_bases
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.scripts.console import run
 
 
@@ -54,12 +59,7 @@ def film(config: FilmConfig) -> str:
         ValueError: no such task, view or perturbation.
         OSError: there is nothing to render with, or the video cannot be written.
     """
-    from lerobot_constructskill.artifacts.folders import replaced
-    from lerobot_constructskill.demos.demonstrate import demonstrate
-    from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
-    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
     from lerobot_constructskill.lerobot_internals import write_video
-    from lerobot_constructskill.progress import Progress, quiet
 
     out = config.out or Path("outputs") / f"{config.task}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())

@@ -39,14 +39,6 @@ SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gri
 PRECISION = ("backbone_precision", "backbone_trained_precision")
 """What frozen_vit's encoder computed in, and in training; they differ where a checkpoint crossed over."""
 
-TYPES = {
-    "training_seed": "Int64",
-    "rmse_rotation_rad": float,
-    "gripper_change_accuracy": float,
-    "consistency_m": float,
-}
-"""Columns in which a value can be missing."""
-
 
 def evaluate_offline(config: OfflineConfig) -> str:
     """Evaluate every checkpoint, write the files and return the table.
@@ -117,7 +109,7 @@ def _training_seed(checkpoint: Path) -> int | None:
 def _write(rows: list[dict], folder: Path) -> str:
     import pandas as pd
 
-    table = pd.DataFrame(rows).astype(TYPES)
+    table = pd.DataFrame(rows).convert_dtypes()
     write_text(folder / "offline.json", json.dumps(rows, indent=2) + "\n")
     with replaced(folder / "offline.parquet") as partial:
         table.to_parquet(partial, index=False)
