@@ -19,7 +19,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, is_typeddict
+from typing import TYPE_CHECKING, Any, ClassVar, is_typeddict
 
 import yaml
 
@@ -95,14 +95,18 @@ class Json[Kind]:
 
     what: str
     kind: type[Kind] = dict[str, Any]
+    most: ClassVar[int] = MOST
 
     def read(self, path: Path) -> Kind:
         """Raises as `read_text` does, and InputError where the file is of another kind."""
-        return self.parse(read_text(path), f"'{path}'")
+        return self.parse(read_text(path, self.most), f"'{path}'")
 
     def parse(self, text: str, where: str) -> Kind:
         """The value of a text that stands at `where`, the subject of whatever is said of it."""
-        return _plain(lambda: self._checked(_json(text)), f"{where} is not {self.what}")
+        return _plain(lambda: self._checked(self._load(text)), f"{where} is not {self.what}")
+
+    def _load(self, text: str) -> Any:
+        return _json(text)
 
     def _checked(self, value: Any) -> Kind:
         from pydantic import ValidationError
@@ -218,12 +222,10 @@ class Yaml[Kind](Json[Kind]):
     """
 
     loader: type[Loader] = Loader
+    most: ClassVar[int] = MOST_YAML
 
-    def read(self, path: Path) -> Kind:
-        return self.parse(read_text(path, MOST_YAML), f"'{path}'")
-
-    def parse(self, text: str, where: str) -> Kind:
-        return _plain(lambda: self._checked(_yaml(text, self.loader)), f"{where} is not {self.what}")
+    def _load(self, text: str) -> Any:
+        return _yaml(text, self.loader)
 
 
 def parse_yaml(text: str, where: str, loader: type[Loader] = Loader) -> Any:

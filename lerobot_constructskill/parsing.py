@@ -13,16 +13,13 @@ from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import draccus
 import mergedeep
+import yaml
 
-from lerobot_constructskill import tags
 from lerobot_constructskill.bounds import UNIONS, allows, refusal
 from lerobot_constructskill.errors import FieldError, InputError, UserError
-from lerobot_constructskill.files import Json, parse_yaml
+from lerobot_constructskill.files import Json, Loader, Yaml, parse_yaml
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find
-
-CONFIGURATION = Json("a configuration")
-"""A configuration in JSON; `tags` reads those in YAML."""
 
 TEXTS = {str, Path, NoneType}
 """Types of fields whose flags are taken as text, as they were written."""
@@ -40,10 +37,8 @@ def parse[Config](
         InputError: they do not make a configuration.
         MissingError: there is no such file, or a `!policy` in it names no shipped policy.
     """
-    named, flags = _take_config_path(flags)
     with as_input():
-        path = config_path if named is None else named
-        return Parser(config_class, path, exit_on_error=False, epilog=epilog).parse_args(flags)
+        return Parser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
 
 
 def parse_named[Config](config_class: type[Config], kind: str, text: str, flags: Sequence[str] = ()) -> Config:
@@ -65,21 +60,14 @@ def parse_named[Config](config_class: type[Config], kind: str, text: str, flags:
     return parse(config_class, [*flags, *own], find(kind, name))
 
 
-def _take_config_path(flags: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The value of `--config_path`, and the other flags."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--config_path")
-    with as_input():
-        taken, others = parser.parse_known_args(flags)
-    return taken.config_path, others
-
-
 class Parser(ArgumentParser):
     """draccus' parser of flags, but their values and the file are read as `files.Loader` reads."""
 
     def _postprocessing(self, flags: argparse.Namespace) -> Any:
-        said = {name: _value(text, _kind_of(self.config_class, name)) for name, text in vars(flags).items()}
-        read = {} if self.config_path is None else _read(Path(self.config_path))
+        texts = {"config_path": self.config_path} | vars(flags)
+        path = texts.pop("config_path")
+        said = {name: _value(text, _kind_of(self.config_class, name)) for name, text in texts.items()}
+        read = {} if path is None else read_fields(Path(path))
         return decode(self.config_class, mergedeep.merge(read, draccus.utils.deflatten(said, sep=".")))
 
 
@@ -112,11 +100,41 @@ def _value(text: str, kind: Any) -> Any:
         return text
 
 
-def _read(path: Path) -> dict[str, Any]:
-    read = CONFIGURATION.read(path) if path.suffix == ".json" else tags.read(path)
-    if not isinstance(read, dict):
-        raise InputError(f"'{path}' is empty or is not a mapping of fields.")
-    return read
+class ConfigurationLoader(Loader):
+    """YAML of our configuration files, in which `!policy` stands for the fields of a shipped policy.
+
+    `!policy precise` stands for the fields of `configs/policy/precise.yaml`; `!policy {preset: precise, camera: base}`
+    for the same fields with another value. The tag opens no other file, and other loaders refuse it.
+    """
+
+    own_tags = frozenset({"!policy"})
+
+
+def _policy(loader: ConfigurationLoader, node: yaml.Node) -> dict[str, Any]:
+    if isinstance(node, yaml.ScalarNode):
+        name, fields = node.value, {}
+    else:
+        fields = loader.construct_mapping(node, deep=True)
+        if "preset" not in fields:
+            raise InputError("`!policy {…}` must name the policy that it starts from, such as `preset: precise`.")
+        name = fields.pop("preset")
+    return read_fields(find("policy", str(name), or_file=False)) | fields
+
+
+ConfigurationLoader.add_constructor("!policy", _policy)
+
+YAML = Yaml("a configuration, a mapping of fields", loader=ConfigurationLoader)
+JSON = Json("a configuration, a mapping of fields")
+
+
+def read_fields(path: Path) -> dict[str, Any]:
+    """The fields of a configuration file as plain values.
+
+    Raises:
+        MissingError: there is no such file, or a `!policy` in it names no shipped policy.
+        InputError: it is not what `files.Loader` reads, no mapping, or a `!policy` in it names no policy.
+    """
+    return (JSON if path.suffix == ".json" else YAML).read(path)
 
 
 def tells_of_bases[Config](config_class: type[Config]) -> type[Config]:

@@ -23,8 +23,7 @@ ARROWS = {
     "lerobot_internals": (),
     "progress": (),
     "presets": (),
-    "tags": ("presets",),
-    "parsing": ("presets", "tags"),
+    "parsing": ("presets",),
     "policy_types": ("parsing",),
     "other_tasks": (),
     "contract": ("other_tasks",),
@@ -103,7 +102,6 @@ ARROWS = {
         "rollout",
         "sim",
         "study",
-        "tags",
     ),
 }
 # Arrows of functions: the simulator is born on first use.
@@ -121,7 +119,6 @@ EXTERNALS = {
     "cameras": {"numpy"},
     "interface": {"numpy"},
     "presets": set(),
-    "tags": {"yaml"},
     "perturbations": set(),
     "artifacts": {"ray"},
     "artifacts.tables": {"pyarrow"},

@@ -17,13 +17,13 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from metadata import write_metadata
 
 import lerobot_constructskill.plugin  # noqa: F401
-from lerobot_constructskill import presets, tags
+from lerobot_constructskill import presets
 from lerobot_constructskill.board.protocol import SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
-from lerobot_constructskill.parsing import parse, parse_named
+from lerobot_constructskill.parsing import parse, parse_named, read_fields
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 from lerobot_constructskill.scripts.config import ConfigConfig, show_or_write, write
@@ -296,7 +296,7 @@ def test_passes_are_counted_in_frames_that_are_trained_on(written):
 @pytest.mark.parametrize("name", TRAIN)
 def test_what_is_written_is_plain_yaml_with_every_field_of_the_policy(name, written, tmp_path):
     file = written(name, out=tmp_path / "mine" / "file.yaml")
-    template, fields = tags.read(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
+    template, fields = read_fields(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
     assert file == tmp_path / "mine" / "file.yaml" and fields["policy"] == template["policy"]
     assert not {"passes", "checkpoints"} & fields.keys()
 

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,12 +19,8 @@ def installed(monkeypatch):
     """Replace the installed packages by others, name to version."""
 
     def install(**versions: str) -> None:
-        def version(name: str) -> str:
-            if name not in versions:
-                raise doctor.metadata.PackageNotFoundError(name)
-            return versions[name]
-
-        monkeypatch.setattr(doctor.metadata, "version", version)
+        found = [SimpleNamespace(name=name, version=version) for name, version in versions.items()]
+        monkeypatch.setattr(doctor.metadata, "distributions", lambda: found)
 
     return install
 

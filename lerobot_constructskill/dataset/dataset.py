@@ -1,6 +1,7 @@
 """Reads a finished data set as plain tables from its files, without LeRobot, whose work the tables serve to check."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
     MADE,
@@ -19,7 +20,7 @@ from lerobot_constructskill.demos.columns import (
     demonstration_features,
 )
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.files import Json, read_parquet
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 from lerobot_constructskill.parsing import decode
@@ -31,6 +32,9 @@ EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_i
 VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
 """What LeRobot's episode tables say of every episode, and of its part of every video."""
 
+
+LATE_S = 1e-4
+"""Seconds by which a frame may be late: LeRobot reads none that is off by more."""
 
 PLACE = re.compile(r"(?!/)([\w./-]|\{(video_key|chunk_index(:0?\dd)?|file_index(:0?\dd)?)\})+")
 """Where a data set's videos may lie, as LeRobot's `video_path` says it."""
@@ -215,3 +219,30 @@ def _tables(root: Path, pattern: str) -> pd.DataFrame:
     if not paths:
         raise InputError(f"{pattern} cannot be read (there is no such file).")
     return pd.concat([read_parquet(path).to_pandas() for path in paths], ignore_index=len(paths) > 1)
+
+
+def video_complaints(path: Path, name: Path, expected: int, fps: float) -> Iterator[str]:
+    """Yield what is wrong with the time stamps of a video: it cannot be read, lacks frames or has another rate.
+
+    Args:
+        name: what to call it.
+        expected: how many frames it has, at least.
+        fps: how many frames a second.
+    """
+    import av
+
+    if not path.is_file():
+        yield f"{name} is missing."
+        return
+    try:
+        with av.open(str(path)) as video:
+            stream = video.streams.video[0]
+            stamps = sorted(packet.pts * stream.time_base for packet in video.demux(stream) if packet.pts is not None)
+    except (av.FFmpegError, IndexError) as error:
+        yield f"{name} cannot be read ({error})."
+        return
+    times = np.array(stamps, dtype=float)
+    if len(times) < expected:
+        yield f"{name} has {plural(len(times), 'frame')}, but its episodes have {expected} rows."
+    elif np.abs(times * fps - np.arange(len(times))).max(initial=0) > LATE_S * FPS:
+        yield f"{name} has not the {fps} frames a second (fps) that meta/info.json says."

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_constructskill.contract import FPS
-from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.dataset.dataset import LATE_S, DataSet, video_complaints
+from lerobot_constructskill.dataset.hub import open_lerobot
 from lerobot_constructskill.errors import InputError, plural
 
 if TYPE_CHECKING:
@@ -19,9 +20,6 @@ FLAT = 2.0
 
 FROZEN_FRAMES, FROZEN_DISTANCE = 5, 0.03
 """Equal pictures in a row, and metres that the arm moved meanwhile, that make a frozen camera."""
-
-LATE_S = 1e-4
-"""Seconds by which a frame may be late: LeRobot reads none that is off by more."""
 
 READ_FRAMES = 64
 """Frames that are read in random order, from the beginning of the data set."""
@@ -49,33 +47,6 @@ def check_videos(data: DataSet) -> Iterator[str]:
             frames[path] += int(episode["length"])
         for path, expected in frames.items():
             yield from video_complaints(path, path.relative_to(data.root), expected, FPS)
-
-
-def video_complaints(path: Path, name: Path, expected: int, fps: float) -> Iterator[str]:
-    """Yield what is wrong with the time stamps of a video: it cannot be read, lacks frames or has another rate.
-
-    Args:
-        name: what to call it.
-        expected: how many frames it has, at least.
-        fps: how many frames a second.
-    """
-    import av
-
-    if not path.is_file():
-        yield f"{name} is missing."
-        return
-    try:
-        with av.open(str(path)) as video:
-            stream = video.streams.video[0]
-            stamps = sorted(packet.pts * stream.time_base for packet in video.demux(stream) if packet.pts is not None)
-    except (av.FFmpegError, IndexError) as error:
-        yield f"{name} cannot be read ({error})."
-        return
-    times = np.array(stamps, dtype=float)
-    if len(times) < expected:
-        yield f"{name} has {plural(len(times), 'frame')}, but its episodes have {expected} rows."
-    elif np.abs(times * fps - np.arange(len(times))).max(initial=0) > LATE_S * FPS:
-        yield f"{name} has not the {fps} frames a second (fps) that meta/info.json says."
 
 
 def check_pictures(data: DataSet) -> Iterator[str]:
@@ -132,8 +103,6 @@ def check_reading(data: DataSet) -> Iterator[str]:
     Raises:
         InputError: LeRobot cannot open the data set, or a video cannot be decoded.
     """
-    from lerobot_constructskill.dataset.hub import open_lerobot
-
     shown = {camera: dict(islice(pictures(data, camera), READ_FRAMES)) for camera in data.cameras}
     rows = np.random.default_rng(0).permutation(min(READ_FRAMES, len(data.rows))).tolist()
     by_default = open_lerobot(data.config.repo_id, data.root)

@@ -7,10 +7,14 @@ from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, snapshot_download
+from huggingface_hub.utils import filter_repo_objects
+
 from lerobot_constructskill.artifacts.digests import data_sha256, files_below
 from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
 from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
-from lerobot_constructskill.dataset.frames import video_complaints
+from lerobot_constructskill.dataset.dataset import read_info, video_complaints
 from lerobot_constructskill.errors import (
     InputError,
     MachineError,
@@ -75,7 +79,6 @@ def pull(repo_id: str, revision: str | None = None) -> Path:
     Raises:
         OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
     """
-    from huggingface_hub import snapshot_download
     from lerobot.datasets import CODEBASE_VERSION
 
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HUB_CACHE
@@ -101,21 +104,17 @@ def open_lerobot(
     """
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_constructskill.dataset.dataset import read_info
-
     if root is not None:
         read_info(root)
     try:
         with one_sentence(repo_id, revision):
             dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
-    except (UserError, OSError) as error:
-        if root is None:
-            raise
-        # It looks on the Hub for what it cannot read, and its last word is about that.
-        raise MachineError(f"LeRobot cannot open the data set in {root} ({first_line(_first(error))}).") from error
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
-        said = f"{type(error).__name__}: {error}"
-        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({said}).") from error
+        if root is None and isinstance(error, UserError | OSError):
+            raise
+        # LeRobot looks on the Hub for what it cannot read, and its last word is about that.
+        said = first_line(_first(error))
+        raise InputError(f"LeRobot cannot open the data set {root or repo_id} ({said}).") from error
     _check_videos(dataset)
     return dataset
 
@@ -211,12 +210,9 @@ def _sources(root: Path) -> list[dict[str, str]]:
 @contextmanager
 def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
-    import httpx
-    from huggingface_hub.errors import HFValidationError
-
     try:
         yield
-    except (OSError, RuntimeError, HFValidationError, httpx.HTTPError) as error:
+    except (OSError, RuntimeError, errors.HFValidationError, httpx.HTTPError) as error:
         # An upload's own error is the cause of a bare RuntimeError.
         reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
         if reason is None:
@@ -226,9 +222,6 @@ def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
 
 def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
     """What an error of the Hub's client means; None for other errors."""
-    import httpx
-    from huggingface_hub import errors
-
     of = f"revision '{revision}' of " if revision else ""
     status = error.response.status_code if isinstance(error, errors.HfHubHTTPError) else None
     reasons = (  # the first whose class and status fit
@@ -264,16 +257,12 @@ def check_private(repo_id: str, repo_type: str = "model") -> None:
     Raises:
         InputError: it is public.
     """
-    from huggingface_hub import HfApi
-
     if not HfApi().repo_info(repo_id, repo_type=repo_type).private:
         raise InputError(f"'{repo_id}' is on the Hub already and public: make it private there, or name another.")
 
 
 def _is_cut(root: Path, **repo: str) -> bool:
     """Whether a repository without LeRobot's tag is empty or holds an interrupted push of the set in `root`."""
-    from huggingface_hub import HfApi
-
     api = HfApi()
     held = set(api.list_repo_files(**repo)) - UNTOUCHED
     if INFO not in held:
@@ -296,8 +285,6 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         InputError: it is public, and `private` is set.
         OSError: the Hub cannot be reached, or refuses the token or the name.
     """
-    from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
-    from huggingface_hub.utils import filter_repo_objects
     from lerobot.datasets import CODEBASE_VERSION
 
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}

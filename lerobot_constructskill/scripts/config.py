@@ -57,12 +57,12 @@ def write(config: ConfigConfig) -> Path:
     """
     import yaml
 
-    from lerobot_constructskill import tags
     from lerobot_constructskill.artifacts.folders import write_text
     from lerobot_constructskill.dataset.hub import locate
     from lerobot_constructskill.dataset.split import split_of
+    from lerobot_constructskill.parsing import read_fields
 
-    template = tags.read(show(config.name))
+    template = read_fields(Path(show(config.name)))
     if config.root is None and config.repo_id is None:
         raise InputError(
             f"{config.name} is written for a data set: add --root=FOLDER, or --repo_id=NAME of one in LeRobot's cache "

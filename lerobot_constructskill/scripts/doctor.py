@@ -160,21 +160,16 @@ def compare_versions(requirements: Iterable[str]) -> str:
         InputError: a package is absent, or its version is out of bounds.
     """
     from packaging.requirements import Requirement
+    from packaging.utils import canonicalize_name
 
-    right, wrong = [], []
-    for one in map(Requirement, requirements):
-        is_extra = one.marker is not None and not one.marker.evaluate({"extra": ""})
-        try:
-            version = metadata.version(one.name)
-        except metadata.PackageNotFoundError:
-            version = "absent"
-        if version != "absent" and one.specifier.contains(version, prereleases=True):
-            right.append(f"{one.name} {version}")
-        elif version != "absent" or not is_extra:
-            wrong.append(f"{one.name} is {version} (needs {one.specifier})")
+    installed = {canonicalize_name(one.name): one.version for one in metadata.distributions() if one.name}
+    found = [(one, installed.get(canonicalize_name(one.name))) for one in map(Requirement, requirements)]
+    needed = [pair for pair in found if pair[1] or not pair[0].marker or pair[0].marker.evaluate({"extra": ""})]
+    wrong = [(one, version) for one, version in needed if not (version and one.specifier.contains(version, True))]
     if wrong:
-        raise InputError(f"{', '.join(wrong)}.")
-    return ", ".join(dict.fromkeys(right))
+        told = ", ".join(f"{one.name} is {version or 'absent'} (needs {one.specifier})" for one, version in wrong)
+        raise InputError(f"{told}.")
+    return ", ".join(dict.fromkeys(f"{one.name} {version}" for one, version in needed))
 
 
 def diagnose(checks: Iterable[Check]) -> int:

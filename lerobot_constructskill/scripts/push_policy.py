@@ -1,12 +1,15 @@
 """`constructskill-push-policy`: upload a checkpoint to the Hub, with its outcomes on its card."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from lerobot_constructskill.bounds import Checked, RepoId
-from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.errors import MissingError
-from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
+from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_task
+from lerobot_constructskill.dataset import markdown
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
 
 PUSHED = ["*.safetensors", "*.json"]
@@ -36,7 +39,6 @@ def push_policy(config: PushPolicyConfig) -> str:
 
     from lerobot_constructskill.dataset.dataset import read_facts
     from lerobot_constructskill.dataset.hub import check_private, one_sentence
-    from lerobot_constructskill.dataset.policy_card import render_card, seed_outcomes
 
     for name in (TRAIN_CONFIG, "config.json"):
         if not (config.policy_path / name).is_file():
@@ -51,6 +53,40 @@ def push_policy(config: PushPolicyConfig) -> str:
         api.upload_folder(repo_id=config.repo_id, folder_path=config.policy_path, allow_patterns=PUSHED)
         api.upload_file(repo_id=config.repo_id, path_or_fileobj=card.encode(), path_in_repo="README.md")
     return f"Pushed: {config.repo_id}"
+
+
+def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
+    """Seed, lifted, placed and evaluated episodes of each `seed_*/eval_info.json` that lerobot-eval wrote.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    outcomes = {}
+    for path in folder.glob("seed_*/eval_info.json"):
+        if not re.fullmatch(r"seed_(0|[1-9][0-9]{0,9})", path.parent.name):
+            raise InputError(f"'{path.parent}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
+        lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
+        outcomes[int(path.parent.name.removeprefix("seed_"))] = lifted, placed, len(stages)
+    if not outcomes:
+        raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
+    return [(seed, *counts) for seed, counts in sorted(outcomes.items())]
+
+
+def render_card(
+    repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
+) -> str:
+    """The card of a policy, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
+    return markdown.render(
+        "policy_card.md.j2",
+        repo_id=repo_id,
+        outcomes=outcomes,
+        task=task,
+        this_seed=train.get("seed"),
+        dataset=train.get("dataset", {}).get("repo_id"),
+        revision=train.get("dataset", {}).get("revision"),
+        policy=policy,
+    )
 
 
 def main() -> None:

@@ -8,11 +8,10 @@ import numpy as np
 from lerobot_constructskill.bounds import Checked, Episodes, RepoId, Text
 from lerobot_constructskill.dataset.dataset import DataSet, open_dataset
 from lerobot_constructskill.dataset.hub import locate
-from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.scripts.console import run, say
+from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
@@ -59,7 +58,7 @@ def replay_episode(data: DataSet, episode: int) -> ReplayResult:
 
 
 def replay_all(config: ReplayConfig) -> str:
-    """Print the noise of each phase, replay, and return the verdict.
+    """Replay and return the verdict.
 
     Raises:
         FileNotFoundError: there is no such data set.
@@ -71,10 +70,6 @@ def replay_all(config: ReplayConfig) -> str:
     episodes = list(everything) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(everything):
         raise InputError(f"episodes must be among 0 to {len(everything) - 1}, not {episodes}.")
-    added, phases = 1000 * data.column("dart.noise"), data.column("phase")
-    for phase in Phase:
-        noise = added[phases == phase]
-        say(f"{phase:<9} {len(noise):6} frames, added mean {noise.mean(0).round(2)} std {noise.std(0).round(2)} mm")
     replays = {episode: replay_episode(data, episode) for episode in Progress(episodes, "replay", unit="demo")}
     different = [str(episode) for episode, one in replays.items() if not one.same_outcome]
     if different:

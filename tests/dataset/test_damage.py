@@ -15,12 +15,12 @@ from lerobot_constructskill.dataset.card import card_facts
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.hub import PUSHED, open_lerobot
-from lerobot_constructskill.dataset.policy_card import render_card, seed_outcomes
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import bounded_memory
 from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
+from lerobot_constructskill.scripts.push_policy import render_card, seed_outcomes
 
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
 BINARY = ("meta/tasks.parquet", "data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4")

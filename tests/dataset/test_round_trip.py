@@ -7,9 +7,9 @@ from commands import call
 from hub_server import TOKENS, serve
 from toy import ToyEnv
 
-from lerobot_constructskill.dataset.policy_card import seed_outcomes
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.scripts.push_policy import seed_outcomes
 
 TOKEN = next(iter(TOKENS))
 ENV = ["--env.type=constructskill", "--env.obs_type=pixels_agent_pos", "--env.episode_length=6"]
