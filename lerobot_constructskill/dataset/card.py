@@ -1,12 +1,14 @@
 """A data set's card: its README.md on the Hub, rendered from the data and the contract table."""
 
+import json
+import re
+from importlib.resources import files
 from typing import Annotated, Any
 
 import numpy as np
 
 from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_fields
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
-from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
@@ -52,6 +54,9 @@ ADVISED = {
     "phase": "the expert's phase, in a demonstration that of what it did itself and not of the advice",
 }
 """What they are where `action` is the expert's advice."""
+
+ACTIVE = re.compile(r"[\x00-\x1f`]|\]\(")
+"""Characters that would end a line, a piece of code or a link's name; HTML is escaped too."""
 
 TURNS = "; turns in rad about the same axes, right-handed"
 """What an action also is in a task that turns."""
@@ -128,7 +133,7 @@ def render(facts: dict[str, Any]) -> str:
         features = as_before_joints(features)
     cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
-    return markdown.render(
+    return render_template(
         "card.md.j2",
         **facts,
         task=task,
@@ -147,8 +152,19 @@ def render(facts: dict[str, Any]) -> str:
 
 def _rename_map(keys: list[str]) -> dict[str, str]:
     """Our cameras under the names that SmolVLA's and pi0's base models expect."""
-    import json
-
     smolvla = {key: f"observation.images.camera{index + 1}" for index, key in enumerate(keys)}
     pi0 = dict(zip(keys, ("observation.images.base_0_rgb", "observation.images.left_wrist_0_rgb"), strict=False))
     return {"smolvla": json.dumps(smolvla), "pi0": json.dumps(pi0)}
+
+
+def render_template(template: str, **facts: Any) -> str:
+    """A template of this folder with its facts filled in, as text only: anybody may have written their files."""
+    from jinja2 import Environment, StrictUndefined
+
+    layout = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(undefined=StrictUndefined, autoescape=True, finalize=_plain, **layout)
+    return environment.from_string(files(__package__).joinpath(template).read_text(encoding="utf-8")).render(**facts)
+
+
+def _plain(value: Any) -> Any:
+    return ACTIVE.sub(" ", value) if type(value) is str else value

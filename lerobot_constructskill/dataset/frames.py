@@ -51,23 +51,21 @@ def check_videos(data: DataSet) -> Iterator[str]:
 
 def check_pictures(data: DataSet) -> Iterator[str]:
     """Decode every frame: none is flat, and none stays the same while the arm moves."""
-    position = data.column("observation.state")[:, :3]
+    rows, position = np.arange(len(data.rows)), data.column("observation.state")[:, :3]
+    way = np.cumsum(np.linalg.norm(np.diff(position, axis=0, prepend=position[:1]), axis=1))
     for camera in data.cameras:
-        flat, frozen, run, moved, before = [], [], 0, 0.0, None
+        flat, same, before = np.zeros(len(rows), dtype=bool), np.zeros(len(rows), dtype=bool), None
         for row, picture in pictures(data, camera):
-            if picture.std() < FLAT:
-                flat.append(row)
-            same = before is not None and np.array_equal(picture, before)
-            run, moved = (run + 1, moved + np.linalg.norm(position[row] - position[row - 1])) if same else (0, 0.0)
-            if run >= FROZEN_FRAMES and moved > FROZEN_DISTANCE:
-                frozen.append(row)
+            flat[row], same[row] = picture.std() < FLAT, before is not None and np.array_equal(picture, before)
             before = picture
-        if flat:
-            yield f"{camera} shows nothing in {plural(len(flat), 'frame')}, first {flat[0]}."
-        if frozen:
+        first = np.maximum.accumulate(np.where(same, 0, rows))  # the first row that shows the same picture
+        frozen = (rows - first >= FROZEN_FRAMES) & (way - way[first] > FROZEN_DISTANCE)
+        if flat.any():
+            yield f"{camera} shows nothing in {plural(flat.sum(), 'frame')}, first {flat.argmax()}."
+        if frozen.any():
             yield (
-                f"{camera} repeats the frame before in {plural(len(frozen), 'frame')} while the arm moves, "
-                f"first {frozen[0]}."
+                f"{camera} repeats the frame before in {plural(frozen.sum(), 'frame')} while the arm moves, "
+                f"first {frozen.argmax()}."
             )
 
 

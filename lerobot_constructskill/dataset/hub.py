@@ -171,12 +171,14 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
-    path = checkpoint / TRAIN_CONFIG
-    if not path.is_file():
-        return set() if _holds_out_as_the_contract(checkpoint) else None
-    told = TRAINED.read(path).get("dataset", {})
+    if not (checkpoint / TRAIN_CONFIG).is_file():
+        spec = SPECIFICATION.read(checkpoint / SPEC) if (checkpoint / SPEC).is_file() else {}
+        return set() if spec.get("training", {}).get("holdout") == HELD_OUT_EVERY else None
+    told = TRAINED.read(checkpoint / TRAIN_CONFIG).get("dataset", {})
     folder = Path(told["root"]) if told.get("root") else HF_LEROBOT_HOME / told.get("repo_id", "")
-    sources = _sources(folder)
+    features = DATA_SET.read(folder / INFO)["features"] if (folder / INFO).is_file() else {}
+    # A feature set says of its columns which data set they were encoded from.
+    sources = [info for one in features.values() if "source_repo_id" in (info := one.get("info") or {})]
     is_it = (
         dataset.repo_id in (told.get("repo_id"), *(source["source_repo_id"] for source in sources))
         or folder.resolve() == dataset.root.resolve()
@@ -191,20 +193,6 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
         tasks.setdefault(next(iter(dataset.meta.episodes[episode]["tasks"]), ""), []).append(episode)
     share = told.get("eval_split") or 0
     return {episode for own in tasks.values() for episode in own[: len(own) - ceil(len(own) * share)]}
-
-
-def _holds_out_as_the_contract(checkpoint: Path) -> bool:
-    path = checkpoint / SPEC
-    told = SPECIFICATION.read(path) if path.is_file() else {}
-    return told.get("training", {}).get("holdout") == HELD_OUT_EVERY
-
-
-def _sources(root: Path) -> list[dict[str, str]]:
-    """What a feature set that lies in a folder says of the data set whose features it holds."""
-    path = root / INFO
-    features = DATA_SET.read(path)["features"] if path.is_file() else {}
-    infos = [feature.get("info") or {} for feature in features.values()]
-    return [info for info in infos if "source_repo_id" in info]
 
 
 @contextmanager

@@ -37,7 +37,7 @@ SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gri
 """Columns that are printed; the files have all."""
 
 PRECISION = ("backbone_precision", "backbone_trained_precision")
-"""What frozen_vit's encoder computed in, and in training; they differ where a checkpoint crossed over."""
+"""Precision of frozen_vit's encoder now and in training; they differ where this machine would emulate the latter."""
 
 
 def evaluate_offline(config: OfflineConfig) -> str:
@@ -47,6 +47,8 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
+    import pandas as pd
+
     from lerobot_constructskill.dataset.hub import choose_held_out, open_lerobot
     from lerobot_constructskill.progress import Progress
 
@@ -61,18 +63,20 @@ def evaluate_offline(config: OfflineConfig) -> str:
     }
     bar = Progress(checkpoints, "policies", unit="policy")
     rows = [_row(path, dataset, episodes, config) | source for path in bar]
-    return _write(rows, config.out)
+    table = pd.DataFrame(rows).convert_dtypes()
+    write_text(config.out / "offline.json", json.dumps(rows, indent=2) + "\n")
+    with replaced(config.out / "offline.parquet") as partial:
+        table.to_parquet(partial, index=False)
+    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="{:.4f}".format)
+    return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {config.out / 'offline.json'} and .parquet"
 
 
 def _find(patterns: list[str]) -> list[Path]:
     """Checkpoints that the patterns match, in their order."""
-    found = []
-    for pattern in patterns:
-        folders = [Path(name) for name in sorted(glob(pattern)) if (Path(name) / "config.json").is_file()]
-        if not folders:
-            raise MissingError(f"'{pattern}' matches no checkpoint's pretrained_model folder.")
-        found += folders
-    return found
+    found = {pattern: sorted(glob(f"{pattern}/config.json")) for pattern in patterns}
+    if missing := [pattern for pattern, files in found.items() if not files]:
+        raise MissingError(f"'{missing[0]}' matches no checkpoint's pretrained_model folder.")
+    return [Path(file).parent for files in found.values() for file in files]
 
 
 def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) -> dict:
@@ -99,22 +103,11 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 
 def _training_seed(checkpoint: Path) -> int | None:
-    """As `lerobot-train` keeps it, or a study."""
+    """The seed that `lerobot-train` or a study wrote beside a checkpoint."""
     for name, kind in ((TRAIN_CONFIG, TRAINED), (SPEC, SPECIFICATION)):
         if (checkpoint / name).is_file():
             return kind.read(checkpoint / name).get("seed")
     return None
-
-
-def _write(rows: list[dict], folder: Path) -> str:
-    import pandas as pd
-
-    table = pd.DataFrame(rows).convert_dtypes()
-    write_text(folder / "offline.json", json.dumps(rows, indent=2) + "\n")
-    with replaced(folder / "offline.parquet") as partial:
-        table.to_parquet(partial, index=False)
-    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
-    return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {folder / 'offline.json'} and .parquet"
 
 
 def main() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot_constructskill.bounds import Checked, RepoId
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_task
-from lerobot_constructskill.dataset import markdown
+from lerobot_constructskill.dataset.card import render_template
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
@@ -77,7 +77,7 @@ def render_card(
     repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any], policy: dict[str, Any]
 ) -> str:
     """The card of a policy, in Markdown, from `train_config.json` (`TRAINED`) and the policy's `config.json`."""
-    return markdown.render(
+    return render_template(
         "policy_card.md.j2",
         repo_id=repo_id,
         outcomes=outcomes,
