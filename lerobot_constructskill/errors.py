@@ -34,7 +34,7 @@ class InputError(UserError, ValueError):
 class FieldError(UserError):
     """An `InputError` of a configuration that LeRobot's commands parse.
 
-    No ValueError: draccus says "Couldn't instantiate class" in place of those, and hands on what others say.
+    It is no ValueError, because draccus replaces the message of a ValueError by "Couldn't instantiate class".
     """
 
 
@@ -82,13 +82,13 @@ def plural(n: int, noun: str) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """Of an error's message, or its class where it has none."""
+    """The first line of an error's message, or the name of its class if there is no message."""
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 @contextmanager
 def heard_by_lerobot() -> Iterator[None]:
-    """Make the block's `InputError` one that LeRobot's commands end in."""
+    """Re-raise an `InputError` as a `FieldError`, whose sentence LeRobot's commands print."""
     try:
         yield
     except InputError as error:
@@ -132,9 +132,9 @@ def keep_traceback(command: Sequence[str], told: str) -> Path | None:
 
 
 def end_lerobots_commands_in_one_sentence() -> None:
-    """Have `lerobot-train` and its like say a `UserError` alone; the traceback is in the log, as of our commands.
+    """Make LeRobot's commands print a `UserError` as one sentence and keep its traceback in a log, as ours do.
 
-    Nothing else that they end in, and no other program, is touched.
+    Other exceptions and other programs stay as they are.
     """
     others = sys.excepthook
 

@@ -55,8 +55,6 @@ def parse_named[Config](config_class: type[Config], kind: str, text: str, flags:
     """
     with as_input():
         name, *own = shlex.split(text) or [""]
-    if {"-h", "--help"} & {*own}:
-        raise InputError(f"'{text}' asks for help, and is no configuration.")
     return parse(config_class, [*flags, *own], find(kind, name))
 
 

@@ -53,17 +53,17 @@ ADVISED = {
     "dart.noise": "executed translation minus the expert's clean one, in DAgger's rounds minus the advised one, m",
     "phase": "the expert's phase, in a demonstration that of what it did itself and not of the advice",
 }
-"""What they are where `action` is the expert's advice."""
+"""Other meanings, for data sets whose `action` is the expert's advice."""
 
 ACTIVE = re.compile(r"[\x00-\x1f`]|\]\(")
 """Characters that would end a line, a piece of code or a link's name; HTML is escaped too."""
 
 TURNS = "; turns in rad about the same axes, right-handed"
-"""What an action also is in a task that turns."""
+"""What follows the meaning of an action in a task that turns."""
 
 
-class Provenance:
-    """What cards and checks read of `meta/constructskill.json`, beside the configuration."""
+class SidecarFields:
+    """The fields of `meta/constructskill.json` that cards and checks read, beside the configuration."""
 
     attempts: Count
     discarded_seeds: list[Seed]
@@ -73,12 +73,12 @@ class Provenance:
 
 
 def card_facts(data: DataSet) -> dict[str, Any]:
-    """The facts of a card: plain values, so that they can be kept beside it and compared with the data later.
+    """The facts of a card as plain values, which can be kept in JSON and compared with the data later.
 
     Raises:
-        InputError: the data set says of itself what none can.
+        InputError: a field of the data set's metadata has an impossible value.
     """
-    check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+    check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:

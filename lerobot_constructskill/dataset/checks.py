@@ -21,7 +21,7 @@ from lerobot_constructskill.contract import (
     SIM_STATE,
     get_task,
 )
-from lerobot_constructskill.dataset.card import Provenance
+from lerobot_constructskill.dataset.card import SidecarFields
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
 from lerobot_constructskill.demos.columns import ACTORS, EXPERT, SIDECAR
@@ -61,7 +61,7 @@ def check_files(data: DataSet) -> Iterator[str]:
 
 def check_schema(data: DataSet) -> Iterator[str]:
     try:
-        check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+        check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
     except InputError as error:
         yield str(error)
     task, features, wanted = get_task(data.config.task), data.info["features"], data.columns

@@ -30,21 +30,21 @@ STATISTICS = Json("statistics of columns", dict[str, dict[str, Any]])
 
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
 VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
-"""What LeRobot's episode tables say of every episode, and of its part of every video."""
+"""Columns of LeRobot's episode tables about every episode, and about its part of every video."""
 
 
 LATE_S = 1e-4
 """Seconds by which a frame may be late: LeRobot reads none that is off by more."""
 
 PLACE = re.compile(r"(?!/)([\w./-]|\{(video_key|chunk_index(:0?\dd)?|file_index(:0?\dd)?)\})+")
-"""Where a data set's videos may lie, as LeRobot's `video_path` says it."""
+"""The places of videos that LeRobot's `video_path` may name: all are inside the data set."""
 
 NUMBERS = {"float32": "f", "float64": "f", "int64": "i", "int32": "i", "bool": "b"}
-"""A column's `dtype` to the kind that NumPy has for it; a whole number that is missing makes all of them floats."""
+"""A column's `dtype` to NumPy's kind; a missing value turns a column of whole numbers into floats."""
 
 
 class Facts(dict):
-    """A JSON object of a data set; what it lacks is no error of those who ask for it.
+    """A JSON object of a data set. A missing field is an `InputError`, because the file is wrong and not our code.
 
     Args:
         file: the file that it is from.
@@ -109,9 +109,9 @@ class DataSet:
 
     @cached_property
     def columns(self) -> dict[str, dict[str, Any]]:
-        """The columns that it should have, those of DAgger among them where it says that a learner drove.
+        """The columns that the data set should have, with DAgger's if a learner drove.
 
-        A set that has no joints at all is of before they were recorded.
+        A set without any column of joints was made before joints were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
         features = made(get_task(self.config.task), self.config.obs_type)

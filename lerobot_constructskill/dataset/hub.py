@@ -1,4 +1,4 @@
-"""Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
+"""Moves data sets to and from the Hub by huggingface_hub; each of its errors becomes one sentence without a token."""
 
 import logging
 from collections.abc import Iterable, Iterator
@@ -40,25 +40,30 @@ PUSHED = [
     "data/*.parquet",
     "videos/*.mp4",
 ]
-"""What leaves the machine; `*` stands for folders as well."""
+"""Files that are uploaded; `*` stands for folders as well."""
 
 SET_FOLDERS = ("data/", "videos/", "meta/")
 """Folders whose files are deleted on the Hub where the pushed set lacks them."""
 
 UNTOUCHED = {".gitattributes"}
-"""What the Hub itself puts into a new repository."""
+"""Files that the Hub itself puts into a new repository."""
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
 
-def locate(repo_id: str | None, root: Path | None, revision: str | None = None) -> Path:
-    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else what the Hub has.
+def locate(repo_id: str | None, root: Path | None = None, revision: str | None = None) -> Path:
+    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else a revision that the Hub has.
+
+    The revision, by default LeRobot's version tag, is downloaded into LeRobot's cache, or found there offline.
 
     Raises:
         ValueError: neither a name nor a folder was given, or a folder and a revision.
-        FileNotFoundError: the folder, or the data set on the Hub, is not there.
+        FileNotFoundError: the folder is not there.
+        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
     """
-    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
+    from lerobot.datasets import CODEBASE_VERSION
+
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 
     if root is not None:
         if not root.is_dir():
@@ -70,19 +75,6 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
         raise InputError("Give a data set's name with --repo_id, or its folder with --root.")
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
-    return pull(repo_id, revision)
-
-
-def pull(repo_id: str, revision: str | None = None) -> Path:
-    """Bring a revision (LeRobot's version tag by default) into LeRobot's cache, or find it there without a network.
-
-    Raises:
-        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
-    """
-    from lerobot.datasets import CODEBASE_VERSION
-
-    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HUB_CACHE
-
     revision = revision or CODEBASE_VERSION
     with one_sentence(repo_id, revision):
         folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
@@ -125,7 +117,7 @@ def _first(error: BaseException) -> BaseException:
 
 
 def _check_videos(dataset: "LeRobotDataset") -> None:
-    """Refuse videos that are not whole, or of another rate than the data set says, before an hour of work."""
+    """Refuse incomplete videos, and videos of another rate than the data set's, before an hour of work."""
     rows: dict[Path, int] = {}
     for episode in dataset.meta.episodes:
         for camera in dataset.meta.video_keys:
@@ -139,12 +131,12 @@ def _check_videos(dataset: "LeRobotDataset") -> None:
 def choose_held_out(
     dataset: "LeRobotDataset", episodes: list[int] | None, checkpoints: Iterable[Path | str]
 ) -> list[int]:
-    """The episodes that were named, or those that the contract holds out, if no checkpoint was trained on them.
+    """The named episodes, or by default those that the contract holds out, if no checkpoint was trained on them.
 
-    Where it cannot be told what a checkpoint was trained on, a line says so.
+    A warning names each checkpoint whose training episodes are unknown.
 
     Raises:
-        InputError: there are none, the data set has not all of them, or a checkpoint has seen one that nobody named.
+        InputError: there are no such episodes, or a checkpoint was trained on one that is held out by default.
     """
     chosen = held_out(dataset.num_episodes) if episodes is None else episodes
     if not chosen:
@@ -163,11 +155,13 @@ def choose_held_out(
 
 
 def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
-    """The episodes of a data set that a checkpoint in a folder says it was trained on, or on their features.
+    """The episodes of a data set on which, or on whose features, a checkpoint in a folder was trained.
 
-    None if it cannot be told: it lies on the Hub, or its training set is not where it was. Of the episodes of each
-    task that it is given LeRobot keeps the last for its own evaluation, a share `eval_split` rounded up. A study and
-    DAgger say how much they hold out, and not of which folder.
+    LeRobot holds out the last episodes of each task, a share `eval_split` that is rounded up. A study and DAgger
+    record how much they hold out, but not of which folder.
+
+    Returns:
+        None if it is unknown: the checkpoint is on the Hub, or its training set was moved.
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 

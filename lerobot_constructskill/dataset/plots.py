@@ -1,4 +1,4 @@
-"""Two pictures of a data set: what its phases look like, and where its end effector went."""
+"""Draws two pictures of a data set: the phases, and the paths of the end effector."""
 
 from itertools import islice
 from pathlib import Path

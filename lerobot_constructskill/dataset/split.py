@@ -1,4 +1,4 @@
-"""How LeRobot is told which demonstrations to hold out: by their order, and a share that it takes from the end."""
+"""Makes LeRobot hold out every eighth demonstration, by the order of episodes and a share at their end."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
 
 SCHEMA = pa.schema([("episode_index", pa.int64()), ("length", pa.int64()), ("tasks", pa.list_(pa.string()))])
-"""What is read of LeRobot's table of episodes."""
+"""The columns that are read of LeRobot's table of episodes."""
 
 
 @dataclass(frozen=True)

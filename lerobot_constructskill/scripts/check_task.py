@@ -1,13 +1,9 @@
-"""`constructskill-check-task`: measure the expert of a new task, and draw a contact sheet to look at."""
+"""`constructskill-check-task`: measure the expert of a new task."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
-
-import numpy as np
-from PIL import Image
 
 from lerobot_constructskill.bounds import Checked, Count
-from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, get_task
+from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -22,32 +18,30 @@ REQUIRED = 0.95
 
 @dataclass
 class CheckTaskConfig(Checked):
-    """Measure the expert of one task of the contract table in random initial states, and save a contact sheet."""
+    """Measure the expert of one task of the contract table in random initial states."""
 
     task: str  # a name in `contract.TASKS`
     states: Count = 100  # random initial states, without rendering
     noise: NoNoise = field(default_factory=NoNoise)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
-    folder: Path = Path("outputs/check")  # where the contact sheet goes
 
 
 def check_task(config: CheckTaskConfig) -> str:
-    """Measure, save the contact sheet, and return the outcome in a sentence.
+    """Measure, and return the outcome in a sentence.
 
     Raises:
         ValueError: there is no such task, or its expert succeeds too seldom.
-        OSError: this machine cannot render.
     """
     from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
     from lerobot_constructskill.analysis.stats.outcomes import Counts
 
-    sheet = save_contact_sheet(config)
     lengths, failures = measure_expert(config)
     _, low, high = clopper_pearson(Counts(len(lengths), config.states))
     report = (
         f"{config.task}: the expert succeeds in {len(lengths)} of {config.states} initial states "
         f"(95 % Clopper-Pearson {low:.1%} to {high:.1%}), in at most {max(lengths, default=0)} of "
-        f"{get_task(config.task).horizon} steps. Look at {sheet}."
+        f"{get_task(config.task).horizon} steps. `constructskill-film --task={config.task} --view=policy` shows what a "
+        "policy sees."
     )
     if len(failures) > (1 - REQUIRED) * config.states:
         raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
@@ -67,21 +61,6 @@ def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
             failures.append(seed)
     env.close()
     return lengths, failures
-
-
-def save_contact_sheet(config: CheckTaskConfig) -> Path:
-    """Save what both cameras show at the start of each phase and at the end, and return the picture's path."""
-    expert = make_expert(get_task(config.task), config.expert)
-    env = ConstructSkillEnv(config.task, "pixels_agent_pos")
-    frames, _ = demonstrate(env, expert, NoNoise(), DEMO_SEED_START)
-    env.close()
-    starts = {frame["phase"]: frame for frame in reversed(frames)}
-    shown = [*reversed(starts.values()), frames[-1]]
-    rows = [np.concatenate([frame[camera.key] for frame in shown], axis=1) for camera in CAMERAS.values()]
-    path = config.folder / f"{config.task}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate(rows)).save(path)
-    return path
 
 
 def main() -> None:

@@ -25,14 +25,14 @@ REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 """Exit statuses: something the user can fix; a fault of this package; Ctrl-C."""
 
 LONGEST = 2000
-"""Characters of a sentence; the log has the whole."""
+"""Largest number of characters of a sentence; the log has all of it."""
 
 DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
 
 
 class Parser(argparse.ArgumentParser):
-    """Of a command without a configuration: what it cannot parse is one sentence too."""
+    """Parser of a command without a configuration, whose refusals are one sentence too."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
@@ -76,8 +76,8 @@ def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> l
 
 @contextmanager
 def edge() -> Iterator[None]:
-    """Turn what a command raises into one sentence and an exit status, and keep its traceback in a log."""
-    # Torch reads it when it is imported. Else its threads spin while they wait for one that another process holds up.
+    """Turn what a command raises into one sentence and an exit status, and keep the traceback in a log."""
+    # Torch reads this when it is imported. By default its threads spin while they wait for each other.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command, debug = list(sys.argv), DEBUG in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != DEBUG]
@@ -94,10 +94,10 @@ def edge() -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Have somewhere to write to, whatever the shell closed and whatever letters its locale has."""
+    """Open streams that the shell has closed, and escape letters that its locale lacks."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            with suppress(OSError):  # the next file would have its number, and be written into
+            with suppress(OSError):  # else the next file gets the number of the stream, and its output
                 os.dup2(os.open(os.devnull, os.O_RDWR), number)
             setattr(sys, name, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  for good
     for stream in (sys.stdout, sys.stderr):
@@ -108,16 +108,16 @@ def _open_streams() -> None:
 
 @cache
 def _hear_no_destructors() -> None:
-    """A full disk is told in one sentence: the destructors of PyAV would tell it once more, in tracebacks."""
+    """Silence tracebacks of an `OSError` in destructors: PyAV's would repeat the sentence about a full disk."""
     of_errors, of_destructors = sys.excepthook, sys.unraisablehook
     sys.excepthook = lambda kind, error, trace: isinstance(error, OSError) or of_errors(kind, error, trace)
     sys.unraisablehook = lambda said: isinstance(said.exc_value, OSError) or of_destructors(said)
 
 
 def say(text: str) -> None:
-    """Print what a command has to say. That nobody can read it stops no work, and is said when that is done.
+    """Print a text. If standard output cannot be written to, the work goes on, and `edge` reports why at its end.
 
-    A reader who has read enough, such as `head`, is no fault.
+    A reader that has closed the pipe, such as `head`, is no error.
     """
     try:
         print(text, flush=True)
@@ -128,11 +128,11 @@ def say(text: str) -> None:
 
 
 _unread: list[OSError] = []
-"""Why standard output cannot be written to."""
+"""The error of writing to standard output, if there was one."""
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """LeRobot warns at every policy that there is no GPU, as most of our users know of their machine."""
+    """Whether a record is worth printing; LeRobot warns at every policy that there is no GPU."""
     return not record.getMessage().startswith("No accelerated backend detected")
 
 

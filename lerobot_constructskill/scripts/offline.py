@@ -39,6 +39,14 @@ SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gri
 PRECISION = ("backbone_precision", "backbone_trained_precision")
 """Precision of frozen_vit's encoder now and in training; they differ where this machine would emulate the latter."""
 
+TYPES = {
+    "training_seed": "Int64",
+    "rmse_rotation_rad": float,
+    "gripper_change_accuracy": float,
+    "consistency_m": float,
+}
+"""Types of columns in which a value can be missing."""
+
 
 def evaluate_offline(config: OfflineConfig) -> str:
     """Evaluate every checkpoint, write the files and return the table.
@@ -63,11 +71,11 @@ def evaluate_offline(config: OfflineConfig) -> str:
     }
     bar = Progress(checkpoints, "policies", unit="policy")
     rows = [_row(path, dataset, episodes, config) | source for path in bar]
-    table = pd.DataFrame(rows).convert_dtypes()
+    table = pd.DataFrame(rows).astype(TYPES)
     write_text(config.out / "offline.json", json.dumps(rows, indent=2) + "\n")
     with replaced(config.out / "offline.parquet") as partial:
         table.to_parquet(partial, index=False)
-    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="{:.4f}".format)
+    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
     return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {config.out / 'offline.json'} and .parquet"
 
 
