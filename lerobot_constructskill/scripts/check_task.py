@@ -40,8 +40,8 @@ def check_task(config: CheckTaskConfig) -> str:
     report = (
         f"{config.task}: the expert succeeds in {len(lengths)} of {config.states} initial states "
         f"(95 % Clopper-Pearson {low:.1%} to {high:.1%}), in at most {max(lengths, default=0)} of "
-        f"{get_task(config.task).horizon} steps. `constructskill-film --task={config.task} --view=policy` shows what a "
-        "policy sees."
+        f"{get_task(config.task).horizon} steps. "
+        f"`constructskill-film --task={config.task} --view=policy` shows what a policy sees."
     )
     if len(failures) > (1 - REQUIRED) * config.states:
         raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
