@@ -59,7 +59,7 @@ def parse_named[Config](config_class: type[Config], kind: str, text: str, flags:
 
 
 class Parser(ArgumentParser):
-    """draccus' parser of flags, but their values and the file are read as `files.Loader` reads."""
+    """draccus' parser of flags, which reads their values and the file by our own loaders."""
 
     def _postprocessing(self, flags: argparse.Namespace) -> Any:
         texts = {"config_path": self.config_path} | vars(flags)
@@ -85,7 +85,7 @@ def _kind_of(config_class: type, name: str) -> Any:
 
 
 def _value(text: str, kind: Any) -> Any:
-    """A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias. Where text belongs, it is text.
+    """The value of a flag: its text, where the field is text or where the text is no YAML, or what it is in YAML.
 
     `~/` is the home folder; a shell does not replace it behind an equals sign.
     """

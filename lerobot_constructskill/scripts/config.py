@@ -22,9 +22,7 @@ class ConfigConfig(Checked):
     lerobot-train --config_path=$(constructskill-config train/act --root=outputs/fast_wrist)
     """
 
-    name: Text | None = (
-        None  # dagger/NAME, generate/NAME, policy/NAME, study/NAME or train/NAME; default: all are listed
-    )
+    name: Text | None = None  # KIND/NAME, KIND is dagger, generate, policy, study or train; default: list all
     root: Path | None = None  # for train/: the data set's folder
     repo_id: RepoId | None = None  # for train/: its name; without root, of one in LeRobot's cache or on the Hub
     passes: Count | None = None  # for train/: how often each frame is trained on; default: as the configuration says

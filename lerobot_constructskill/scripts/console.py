@@ -63,8 +63,8 @@ def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> l
     values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
     if len(values) > len(first):
         raise InputError(
-            f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
-            "marks, so that the shell leaves it alone."
+            f"{len(values)} values stand before the flags, where {' and '.join(first)} can stand: put a pattern in "
+            "quotation marks, so that the shell leaves it alone."
         )
     named, others = [], flags[len(values) :]
     for name, value in zip(first, values, strict=False):
