@@ -8,7 +8,7 @@ import pytest
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts import doctor
-from lerobot_constructskill.scripts.doctor import CHECKS, FAIL, OK, WARN, Check, compare_versions, diagnose, probe
+from lerobot_constructskill.scripts.doctor import FAIL, OK, PROBES, WARN, Probe, answer, compare_versions, diagnose
 
 REPOSITORY = Path(__file__).parents[1]
 REQUIREMENTS = ["lerobot[dataset]<0.7,>=0.6.1", "sapien<3.1,>=3.0.3; extra == 'sim'", "ruff; extra == 'dev'"]
@@ -53,28 +53,28 @@ def test_the_pinned_lerobot_was_tried_and_so_says_the_page() -> None:
 
 
 RIGHT, ODD, WRONG = (
-    Check("Thing", "print('before'); print('all is well')", "do it"),
-    Check("Thing", "raise RuntimeError('a\\nodd thing.')", "do that", WARN),
-    Check("Thing", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "buy another machine"),
+    Probe("Thing", "print('before'); print('all is well')", "do it"),
+    Probe("Thing", "raise RuntimeError('a\\nodd thing.')", "do that", WARN),
+    Probe("Thing", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "buy another machine"),
 )
 
 
 def test_an_answer_is_the_last_line_and_a_complaint_ends_in_what_to_do() -> None:
-    assert probe(RIGHT) == (OK, "all is well")
-    assert probe(ODD) == (WARN, "odd thing; do that.")
-    assert probe(WRONG) == (FAIL, "the process died of signal 11; buy another machine.")
+    assert answer(RIGHT) == (OK, "all is well")
+    assert answer(ODD) == (WARN, "odd thing; do that.")
+    assert answer(WRONG) == (FAIL, "the process died of signal 11; buy another machine.")
 
 
-@pytest.mark.parametrize(("checks", "status"), [([RIGHT], 0), ([RIGHT, ODD], 0), ([RIGHT, WRONG], 1), ([ODD], 1)])
-def test_exit_status(checks: list[Check], status: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert diagnose(checks) == status
-    assert capsys.readouterr().out.startswith(probe(checks[0])[0])
+@pytest.mark.parametrize(("probes", "status"), [([RIGHT], 0), ([RIGHT, ODD], 0), ([RIGHT, WRONG], 1), ([ODD], 1)])
+def test_exit_status(probes: list[Probe], status: int, capsys: pytest.CaptureFixture[str]) -> None:
+    assert diagnose(probes) == status
+    assert capsys.readouterr().out.startswith(answer(probes[0])[0])
 
 
 @pytest.mark.slow
 @pytest.mark.sim
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
-def test_nothing_is_wrong_with_the_machine_that_tests(check: Check) -> None:
-    level, said = probe(check)
-    assert level == OK or check.level == WARN, said
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.name)
+def test_nothing_is_wrong_with_the_machine_that_tests(probe: Probe) -> None:
+    level, said = answer(probe)
+    assert level == OK or probe.level == WARN, said
     assert "\n" not in said

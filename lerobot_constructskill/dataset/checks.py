@@ -46,8 +46,8 @@ HARDLY_ASKED = 0.1
 """An axis that is asked for less than this share of the strongest one moves by the arm's sag: no response to judge."""
 
 
-def _true(complaints: Mapping[str, Any]) -> Iterator[str]:
-    """The sentences whose conditions hold."""
+def _found(complaints: Mapping[str, Any]) -> Iterator[str]:
+    """The sentences whose conditions hold, in their order."""
     return (said for said, is_wrong in complaints.items() if is_wrong)
 
 
@@ -75,7 +75,7 @@ def check_schema(data: DataSet) -> Iterator[str]:
     stored = {name for name, feature in wanted.items() if feature["dtype"] != "video"} | BOOKKEEPING
     for name in sorted(stored ^ set(data.rows.columns)):
         yield f"data/ {'has no' if name in stored else 'has an unknown'} column {name}."
-    yield from _true(
+    yield from _found(
         {
             f"info.json says {data.info['fps']} frames a second, not {FPS}.": data.info["fps"] != FPS,
             f"The instruction is {data.tasks}, not '{task.instruction}'.": data.tasks != [task.instruction],
@@ -87,7 +87,7 @@ def check_values(data: DataSet) -> Iterator[str]:
     for name, feature in data.info["features"].items():
         if feature["dtype"] == "float32":
             off = ~np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
-            yield from _true({f"{name} is not finite in {plural(off.sum(), 'frame')}.": off.any()})
+            yield from _found({f"{name} is not finite in {plural(off.sum(), 'frame')}.": off.any()})
     experts = data.rounds == 0  # a learner's action is bounded by the environment alone
     limits = {"action": ACTION_SCALE, "dart.executed_action": np.where(experts, data.config.noise.clip, ACTION_SCALE)}
     for name, limit in limits.items():
@@ -95,10 +95,10 @@ def check_values(data: DataSet) -> Iterator[str]:
         odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED)) & (experts | (name == "action"))
         units = f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
         gripper = f"{name} has a gripper that is neither +1 nor -1 in {plural(odd.sum(), 'frame')}."
-        yield from _true({units: (largest > limit + 1e-6).any(), gripper: odd.any()})
+        yield from _found({units: (largest > limit + 1e-6).any(), gripper: odd.any()})
     state, rewards = data.column("observation.state"), (0, REWARD_LIFTED, REWARD_PLACED)
     reach, fingers = np.linalg.norm(state[:, :3], axis=1).max(), state[:, 6:]
-    yield from _true(
+    yield from _found(
         {
             f"observation.state has positions beyond the robot's reach of {REACH} m.": reach > REACH,
             "observation.state has finger positions outside 0 to 0.04 m.": not (
@@ -169,7 +169,7 @@ def check_episodes(data: DataSet) -> Iterator[str]:
     other = data.column("task_index") != 0
     unknown = f"task_index is of another instruction than the only one in {plural(other.sum(), 'frame')}."
     uncounted = "index does not count the frames of the data set one by one."
-    yield from _true(
+    yield from _found(
         {uncounted: not np.array_equal(data.column("index"), np.arange(rows)), unknown: other.any()}
         | {
             f"info.json says {name} is {data.info.get(name)}, but there are {count}.": data.info.get(name) != count
@@ -183,7 +183,7 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
     done, success = data.column("next.done")[span], data.column("next.success")[span]
     place, phases = (episode["dataset_from_index"], episode["dataset_to_index"]), data.column("phase")[span]
     counted = np.array_equal(data.column("frame_index")[span], np.arange(length))
-    yield from _true(
+    yield from _found(
         {
             f"{who} has a gap: frame_index does not count its {length} frames.": not counted,
             f"{who} has rows {span.start} to {span.stop}, its metadata have others.": place != (span.start, span.stop),
@@ -224,7 +224,7 @@ def check_hold_out(data: DataSet) -> Iterator[str]:
     """Holding out whole episodes separates seeds: no seed makes two episodes, and none is an evaluation's."""
     seeds, counts = np.unique(data.column("sim.seed")[[span.start for span in data.spans()]], return_counts=True)
     twice, low = seeds[counts > 1], seeds[seeds < DEMO_SEED_START]
-    yield from _true(
+    yield from _found(
         {
             f"Seeds {_few(twice)} made several episodes, so holding one out does not hold it out.": len(twice),
             f"Seeds {_few(low)} are below {DEMO_SEED_START}: evaluations use those.": len(low),
@@ -255,7 +255,7 @@ def check_provenance(data: DataSet) -> Iterator[str]:
     drawn, told = data.config.noise.root @ data.config.noise.root, data.facts["noise_covariance"]
     missing = ", ".join(sorted(set(FRAME_PACKAGES) - data.facts["versions"].keys()))
     yield from check_rounds(data)
-    yield from _true(
+    yield from _found(
         {
             "The seeds of the episodes and the discarded ones are not those of the attempts, one by one.": (
                 not _counts(sorted([*seeds, *discarded]), attempts)
@@ -277,7 +277,7 @@ def check_rounds(data: DataSet) -> Iterator[str]:
     by_expert = actors == EXPERT
     unknown = set(data.rounds) - {0} - {entry["round"] for entry in listed}
     off = np.abs(data.column("dart.executed_action") - data.column("action"))[by_expert & (data.rounds > 0)]
-    yield from _true(
+    yield from _found(
         {
             f"dagger.actor is not one of {', '.join(ACTORS)} everywhere.": not np.isin(actors, ACTORS).all(),
             "Somebody other than the expert acts in a demonstration.": not by_expert[data.rounds == 0].all(),
@@ -291,7 +291,7 @@ def check_rounds(data: DataSet) -> Iterator[str]:
         number, first, rows = entry["round"], entry["seed_start"], data.rounds == entry["round"]
         counts, told = (int(rows.sum()), int(by_expert[rows].sum())), (entry["frames"], entry["by_expert"])
         seeds = sorted([*np.unique(data.column("sim.seed")[rows]).tolist(), *entry["discarded_seeds"]])
-        yield from _true(
+        yield from _found(
             {
                 f"Round {number} has {counts[0]} frames, {counts[1]} by the expert; its provenance says {told[0]} and "
                 f"{told[1]}.": counts != told,

@@ -16,7 +16,7 @@ PROBE_TIMEOUT_S = 600
 
 
 @dataclass(frozen=True)
-class Check:
+class Probe:
     """A question to this machine.
 
     Args:
@@ -113,44 +113,44 @@ print(
 
 REINSTALL = f"pip install --force-reinstall '{DISTRIBUTION}', or the checkout's folder in its place"
 WEIGHTS = "let this machine reach the Hub, or give a local copy with --policy.backbone_path"
-CHECKS = (
-    Check("Versions", VERSIONS, REINSTALL),
-    Check(
+PROBES = (
+    Probe("Versions", VERSIONS, REINSTALL),
+    Probe(
         "Vulkan",
         RENDER,
         f"pip install '{DISTRIBUTION}[sim]', and apt-get install mesa-vulkan-drivers libvulkan1, 24.3 or newer "
         "(Debian 12: its backports; Ubuntu 24.04), or on an NVIDIA machine the driver's Vulkan part (in a container: "
         "NVIDIA_DRIVER_CAPABILITIES=all)",
     ),
-    Check(
+    Probe(
         "FFmpeg", DECODE, "LeRobot decodes with PyAV; apt-get install ffmpeg, or the libpython that is not found", WARN
     ),
-    Check("Plugin", REGISTER, REINSTALL),
-    Check("Weights", FIND_WEIGHTS, WEIGHTS, WARN),
-    Check("Encoder", ENCODE, "fix what fails above first"),
+    Probe("Plugin", REGISTER, REINSTALL),
+    Probe("Weights", FIND_WEIGHTS, WEIGHTS, WARN),
+    Probe("Encoder", ENCODE, "fix what fails above first"),
 )
 
 
-def fetching() -> list[Check]:
-    """A check for each backbone that fetches its weights, into the Hub's cache where that is their source."""
+def fetching() -> list[Probe]:
+    """A probe for each backbone that fetches its weights, into the Hub's cache where that is their source."""
     from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
 
-    return [Check(name, FETCH_WEIGHTS.format(name=name), WEIGHTS, WARN) for name in BACKBONES]
+    return [Probe(name, FETCH_WEIGHTS.format(name=name), WEIGHTS, WARN) for name in BACKBONES]
 
 
-def probe(check: Check) -> tuple[str, str]:
-    """Run a check and return the level of its answer, and the answer: the last line that it printed or complained."""
-    command = [sys.executable, "-c", check.code]
+def answer(probe: Probe) -> tuple[str, str]:
+    """Run a probe and return the level of its answer, and the answer: the last line that it printed or complained."""
+    command = [sys.executable, "-c", probe.code]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        return check.level, f"no answer within {PROBE_TIMEOUT_S} s; is this machine busy?"
+        return probe.level, f"no answer within {PROBE_TIMEOUT_S} s; is this machine busy?"
     if done.returncode == 0:
         return OK, done.stdout.strip().splitlines()[-1]
     died = [f"the process died of signal {-done.returncode}"]
     said = done.stderr.strip().splitlines() if done.returncode > 0 else died
     complaint = said[-1].partition(": ")[2] or said[-1]  # without the name of the exception
-    return check.level, f"{complaint.rstrip('.')}; {check.remedy}."
+    return probe.level, f"{complaint.rstrip('.')}; {probe.remedy}."
 
 
 def compare_versions(requirements: Iterable[str]) -> str:
@@ -172,10 +172,10 @@ def compare_versions(requirements: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(f"{one.name} {version}" for one, version in needed))
 
 
-def diagnose(checks: Iterable[Check]) -> int:
-    """Run the checks, print each answer as it comes, and return the exit status: 1 if one failed or none passed."""
+def diagnose(probes: Iterable[Probe]) -> int:
+    """Run the probes, print each answer as it comes, and return the exit status: 1 if one failed or none passed."""
     levels = []
-    for name, (level, said) in ((check.name, probe(check)) for check in checks):
+    for name, (level, said) in ((probe.name, answer(probe)) for probe in probes):
         levels.append(level)
         say(f"{level:<4}  {name:<17}  {said}")
     say(f"{plural(len(levels), 'check')}, {levels.count(FAIL)} failed, {levels.count(WARN)} warned.")
@@ -193,4 +193,4 @@ def main() -> None:
         "--weights", action="store_true", help="fetch the weights of every backbone instead, check and name them"
     )
     with edge():
-        sys.exit(diagnose(fetching() if parser.parse_args().weights else CHECKS))
+        sys.exit(diagnose(fetching() if parser.parse_args().weights else PROBES))
