@@ -237,7 +237,7 @@ def test_a_killed_run_of_two_workers_continues_to_the_bytes_of_an_undisturbed_on
 @pytest.mark.slow
 def test_the_replay_command_says_how_many_ended_as_recorded(demonstrations):
     said = call("constructskill-replay", f"--root={demonstrations}", "--episodes=[2]")
-    assert said.startswith("PREGRASP") and "1 demonstration ended as recorded" in said
+    assert "1 demonstration ended as recorded" in said
 
 
 @pytest.mark.nightly
