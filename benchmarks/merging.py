@@ -9,7 +9,7 @@ from measure import OUT, CpuTimer, report
 from merge_many import copies
 
 from lerobot_constructskill.demos import merge
-from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.lerobot_internals import load_episodes
 
 COUNT, TURNS = 20, 3

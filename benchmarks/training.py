@@ -5,7 +5,7 @@ import shutil
 
 from measure import LOG, OUT, report, run
 
-from lerobot_constructskill.scripts.config import TrainingFile, write
+from lerobot_constructskill.scripts.config import ConfigConfig, write
 
 RECIPE_SAMPLES = 150 * 7252
 """What one seed of the recipe sees: 150 passes over the 70 demonstrations of the fast set that are not held out."""
@@ -44,7 +44,7 @@ def train(number: int, steps: int, *flags: str) -> tuple[float, float]:
 
 def main() -> None:
     video_seconds, video_rate = train(0, VIDEO_STEPS, *VIDEO, "--num_workers=0")
-    features = f"--config_path={write(TrainingFile('frozen_vit_fast', OUT / 'features'))}"
+    features = f"--config_path={write(ConfigConfig('train/frozen_vit_fast', OUT / 'features'))}"
     stock = [train(seed, STEPS, features, f"--seed={seed}") for seed in range(1, 1 + STOCK_RUNS)]
     feature_rate = sum(rate for _, rate in stock) / STOCK_RUNS
     what = "training samples/s under stock lerobot-train"

@@ -8,7 +8,7 @@ import re
 import sys
 from pathlib import Path
 
-from lerobot_constructskill.dataset.policy_card import seed_outcomes
+from lerobot_constructskill.scripts.push_policy import seed_outcomes
 
 
 def main(folder: Path) -> None:

@@ -16,7 +16,7 @@ sim         the simulator
 policies    frozen_vit
 artifacts   nodes and the store that makes them: specifications, digests, revisions of our code, locks, worker pools
 files       how a file is read that another may have written: JSON, YAML, Parquet
-parsing     flags and files into configurations; bounds, tags and presets are what it reads by
+parsing     flags and files into configurations; bounds and presets are what it reads by
 errors      what is meant for the user
 interface   the contract of a task in plain values: units, ranges, frames, cameras
 contract    tasks, units and names, each once

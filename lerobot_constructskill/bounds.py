@@ -9,41 +9,33 @@
         def __post_init__(self):
             check(self)
 
-draccus strips the annotations and decodes and helps as before. It lets through what it calls a float (NaN), a whole
-number (true) or nothing at all where something is needed, which `check` does not. pydantic's dataclasses, which do
-the same, bring an initialiser of their own that LeRobot's registries of dataclasses do not inherit, turn "3" into 3
-unless told otherwise, and complain in several lines; what is left of them to use is shorter than its adapter.
+draccus strips the annotations, decodes and prints help as before. draccus accepts NaN as a float, true as a whole
+number, and None where a value is needed; `check` refuses them. pydantic's dataclasses bring an initialiser of their
+own, which LeRobot's registries of dataclasses do not inherit, and its patterns know no look-ahead.
 """
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from functools import cache
+from dataclasses import dataclass, fields, is_dataclass
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Protocol, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Union, get_args, get_origin, get_type_hints
 
 from lerobot_constructskill.errors import InputError
 
 LONGEST = 100
-"""Characters of a refused value that are quoted."""
-
-
-class Rule(Protocol):
-    """A part of an annotation."""
-
-    def allows(self, value: Any) -> bool:
-        """Whether a value of the annotated type is right."""
-
-    def wanted(self, kind: str) -> str:
-        """What would be right, where `kind` is what the annotated type is called."""
+"""Largest number of characters of a refused value that a message quotes."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """A number between bounds, in a unit; NaN and infinities are never numbers here."""
+    """A finite number between bounds, in a unit.
+
+    Every rule has `allows`, whether a value of the annotated type is right, and `wanted`, which describes the right
+    values; its argument `kind` describes all values of the annotated type.
+    """
 
     least: float = -math.inf
     most: float = math.inf
@@ -77,13 +69,13 @@ class Among:
 
 @dataclass(frozen=True)
 class NotEmpty:
-    """A list with something in it."""
+    """A list with at least one item."""
 
     def allows(self, value: Sequence[Any]) -> bool:
         return len(value) > 0
 
     def wanted(self, kind: str) -> str:
-        return "a list of at least one"
+        return kind.replace("a list", "a list of at least one", 1)
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,7 @@ class Present:
 
         try:
             torch.empty(0, device=value)
-        except (RuntimeError, AssertionError, NotImplementedError):  # all three mean that there is none
+        except (RuntimeError, AssertionError, NotImplementedError):  # PyTorch has three ways to say that it is absent
             return False
         return True
 
@@ -123,7 +115,7 @@ UNSEEN = (
     "\x00-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f\u2028-\u202e\u2060-\u206f"
     "\u2800\u3164\ud800-\uf8ff\ufe00-\ufe0f\ufeff\uffa0\ufff0-\uffff\U000e0000-\U0010ffff"
 )
-"""Characters that cannot be seen, turn text around, have no meaning, or are halves of one, which no file can hold."""
+"""Characters that are invisible, reverse the direction of text, have no meaning, or are half of a surrogate pair."""
 
 _WORD = r"(?!.*(?:--|\.\.))[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9_])?"
 
@@ -140,8 +132,15 @@ RepoId = Annotated[str, Pattern(rf"{_WORD}/{_WORD}", "user/name, each of letters
 Device = Annotated[str, Present()]
 
 
+class Checked:
+    """Base of a dataclass that is checked when it is made. Raises as `check` does."""
+
+    def __post_init__(self):
+        check(self)
+
+
 def check(config: Any, of: str = "") -> None:
-    """Refuse a dataclass one of whose fields holds what its annotation does not allow.
+    """Refuse a dataclass that has a field whose value its annotation does not allow.
 
     Args:
         of: what stands before a field's name where the dataclass is itself a field, such as "noise.".
@@ -149,77 +148,70 @@ def check(config: Any, of: str = "") -> None:
     Raises:
         InputError: the message names the field, its value and what would be right.
     """
-    check_values(type(config), {field.name: getattr(config, field.name) for field in fields(config)}, of)
+    check_fields(type(config), {field.name: getattr(config, field.name) for field in fields(config)}, of)
 
 
-def check_values(annotated: Any, values: Mapping[str, Any], of: str = "") -> None:
+def check_fields(annotated: Any, values: Mapping[str, Any], of: str = "") -> None:
     """Refuse values that the annotations of a class or a function do not allow. Raises as `check` does."""
-    kinds = _annotations(annotated)
+    kinds = get_type_hints(annotated, include_extras=True)
     for name, value in values.items():
-        if name in kinds and (wanted := _complaint(value, kinds[name])):
-            raise InputError(f"{of}{name} must be {wanted}, not {_quoted(value)}.")
+        if name in kinds and not allows(kinds[name], value):
+            raise InputError(refusal(f"{of}{name}", kinds[name], value))
 
 
-@cache
-def _annotations(annotated: Any) -> dict[str, Any]:
-    return get_type_hints(annotated, include_extras=True)
+def refusal(name: str, kind: Any, value: Any) -> str:
+    """The sentence that refuses a field's value."""
+    text = " ".join(repr(value).split())
+    return f"{name} must be {wanted(kind)}, not {text if len(text) <= LONGEST else f'{text[:LONGEST]}...'}."
 
 
-def _complaint(value: Any, kind: Any) -> str | None:
-    """What would be right in place of `value`; None where it is right."""
+def allows(kind: Any, value: Any) -> bool:
+    """Whether a value is what an annotation describes; types that this module does not know allow everything."""
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        base, *rules = inner
-        if get_origin(base) is list and _is_list(value) and (complaint := _complaint(value, base)):
-            return complaint  # of an item, which the rules of the list say nothing about
-        wrong = [rule for rule in rules if _complaint(value, base) or not rule.allows(value)]
-        return wrong[0].wanted(NAMES.get(base, "a value")) if wrong else None
-    if origin in (Union, UnionType):
-        if value is None and NoneType in inner:
-            return None
-        complaints = [_complaint(value, one) for one in inner if one is not NoneType]
-        return None if None in complaints else " or ".join(complaints)
+        return allows(inner[0], value) and all(rule.allows(value) for rule in inner[1:])
+    if origin in UNIONS:
+        return any(allows(one, value) for one in inner)
     if origin is list:
-        wrong = [complaint for item in value if (complaint := _complaint(item, *inner))] if _is_list(value) else ["it"]
-        return f"a list, each {_wanted_of(*inner)}" if wrong else None
+        return isinstance(value, Sequence) and not isinstance(value, str) and all(allows(*inner, one) for one in value)
     if origin is dict:
-        if not isinstance(value, Mapping):
-            return "a mapping of names to values"
-        wrong = [complaint for pair in value.items() for complaint in map(_complaint, pair, inner) if complaint]
-        return f"a mapping, with {wrong[0]} in place of what is there" if wrong else None
-    return None if kind not in _TESTS or _TESTS[kind](value) else NAMES[kind]
+        return isinstance(value, Mapping) and all(all(map(allows, inner, pair)) for pair in value.items())
+    if is_dataclass(kind):
+        return isinstance(value, Mapping | kind)
+    return kind not in TESTS or TESTS[kind](value)
 
 
-def _wanted_of(kind: Any) -> str:
-    """What a value of some type would be: what is said to one that never is."""
-    return _complaint(_NOTHING, kind) or "anything"
+def wanted(kind: Any) -> str:
+    """Describe the values that an annotation allows."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        described = wanted(inner[0])
+        for rule in inner[1:]:
+            described = rule.wanted(described)
+        return described
+    if origin in UNIONS:
+        return " or ".join(wanted(one) for one in inner if one is not NoneType)
+    if origin is list:
+        return f"a list, each {wanted(*inner)}"
+    if origin is dict or is_dataclass(kind):
+        return "a mapping" + (f" of {wanted(inner[0])} to {wanted(inner[1])}" if inner else "")
+    return NAMES.get(kind, "something else")
 
 
-def _is_list(value: Any) -> bool:
-    return isinstance(value, Sequence) and not isinstance(value, str)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-
-
-_NOTHING = object()
+UNIONS = (Union, UnionType)
 NAMES = {
     int: "a whole number",
     float: "a finite number",
     bool: "true or false",
     str: "text",
     Path: "a path",
+    Any: "anything",
 }
-_TESTS = {
+TESTS = {
     int: lambda value: isinstance(value, Integral) and not isinstance(value, bool),
-    float: _is_number,
+    float: lambda value: isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value),
     bool: lambda value: isinstance(value, bool),
     str: lambda value: isinstance(value, str),
     Path: lambda value: isinstance(value, str | Path) and "\0" not in str(value),
+    NoneType: lambda value: value is None,
 }
-
-
-def _quoted(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."

@@ -1,4 +1,4 @@
-"""What is meant for the user, told apart from what is a fault of ours. Standard library only.
+"""Errors that are meant for the user, told apart from faults of ours, and their words. Standard library only.
 
 A `UserError` is a sentence that says what is wrong with a request, a file or a machine, and what to do about it. Any
 other exception that leaves the package is a defect of it, or an `OSError` of the operating system.
@@ -10,7 +10,7 @@ import shlex
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
@@ -34,7 +34,7 @@ class InputError(UserError, ValueError):
 class FieldError(UserError):
     """An `InputError` of a configuration that LeRobot's commands parse.
 
-    No ValueError: draccus says "Couldn't instantiate class" in place of those, and hands on what others say.
+    It is no ValueError, because draccus replaces the message of a ValueError by "Couldn't instantiate class".
     """
 
 
@@ -82,13 +82,13 @@ def plural(n: int, noun: str) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """Of an error's message, or its class where it has none."""
+    """The first line of an error's message, or the name of its class if there is no message."""
     return next(iter(str(error).strip().splitlines()), type(error).__name__)
 
 
 @contextmanager
 def heard_by_lerobot() -> Iterator[None]:
-    """Make the block's `InputError` one that LeRobot's commands end in."""
+    """Re-raise an `InputError` as a `FieldError`, whose sentence LeRobot's commands print."""
     try:
         yield
     except InputError as error:
@@ -112,35 +112,29 @@ def full_traceback(error: BaseException) -> str:
 
 
 def keep_traceback(command: Sequence[str], told: str) -> Path | None:
-    """Add a traceback to a command's log, or where the home folder cannot be written to a new one.
+    """Add a traceback to a command's log, in the home folder or, where that cannot be written, in the temporary one.
 
     Returns:
         The log; None where that fails as well.
     """
     name = Path(command[0]).stem
     entry = f"{datetime.now():%Y-%m-%d %H:%M:%S}  {shlex.join(command)}\n{told}\n"
-    text = {"encoding": "utf-8", "errors": "backslashreplace"}  # a path need not be UTF-8
-    try:
-        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local/state") / "constructskill"
-        folder.mkdir(parents=True, exist_ok=True)
-        log = folder / f"{name}.log"
-        with log.open("a", **text) as file:
-            file.write(entry)
-        return log
-    except (OSError, RuntimeError):  # Path.home raises the latter for a user who has none
-        pass
-    try:
-        with tempfile.NamedTemporaryFile("w", prefix=f"{name}-", suffix=".log", delete=False, **text) as file:
-            file.write(entry)
-        return Path(file.name)
-    except OSError:
-        return None
+    state = Path(os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state"), "constructskill")
+    for log in (state / f"{name}.log", Path(tempfile.gettempdir(), f"{name}-{os.getuid()}.log")):
+        with suppress(OSError):
+            log.parent.mkdir(parents=True, exist_ok=True)
+            # A path need not be UTF-8, and a folder of everybody's may hold a link to a file of somebody's.
+            mode = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW
+            with open(os.open(log, mode, 0o600), "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(entry)
+            return log
+    return None
 
 
 def end_lerobots_commands_in_one_sentence() -> None:
-    """Have `lerobot-train` and its like say a `UserError` alone; the traceback is in the log, as of our commands.
+    """Make LeRobot's commands print a `UserError` as one sentence and keep its traceback in a log, as ours do.
 
-    Nothing else that they end in, and no other program, is touched.
+    Other exceptions and other programs stay as they are.
     """
     others = sys.excepthook
 

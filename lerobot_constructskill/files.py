@@ -19,7 +19,7 @@ from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, is_typeddict
+from typing import TYPE_CHECKING, Any, ClassVar, is_typeddict
 
 import yaml
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 MOST, MOST_YAML = 8 << 20, 1 << 18
-"""Bytes of a file of JSON, and of YAML, which takes a hundred times as long to read."""
+"""Bytes that a file of JSON may have, and one of YAML, which takes a hundred times as long to read."""
 
 MOST_VALUES = 300_000
-"""In a file, with those that aliases of YAML stand for: a few hundred bytes can stand for billions."""
+"""Values that a file may hold, with what aliases of YAML repeat: a few hundred bytes can repeat billions."""
 
 MOST_BITS = 64
-"""Of a whole number."""
+"""Bits that a whole number may have."""
 
 MERGE = "tag:yaml.org,2002:merge"
 PAGE = 4096
@@ -71,7 +71,7 @@ def read_bytes(path: Path, most: int = MOST, links: bool = True) -> bytes:
 
 
 def read_text(path: Path, most: int = MOST) -> str:
-    """The same as text. Raises as `read_bytes` does, and InputError where it is not UTF-8."""
+    """The content of a regular file as text. Raises as `read_bytes` does, and InputError where it is not UTF-8."""
     return to_text(read_bytes(path, most), f"'{path}'")
 
 
@@ -89,20 +89,24 @@ class Json[Kind]:
 
     Args:
         what: what such a file is called, with its article.
-        kind: the type of its value. Nothing is converted. What a `TypedDict` does not name is kept, what a dataclass
-            does not is refused.
+        kind: the type of the value; nothing is converted. A field that a `TypedDict` does not name is kept, one that a
+            dataclass does not name is refused.
     """
 
     what: str
     kind: type[Kind] = dict[str, Any]
+    most: ClassVar[int] = MOST
 
     def read(self, path: Path) -> Kind:
         """Raises as `read_text` does, and InputError where the file is of another kind."""
-        return self.parse(read_text(path), f"'{path}'")
+        return self.parse(read_text(path, self.most), f"'{path}'")
 
     def parse(self, text: str, where: str) -> Kind:
         """The value of a text that stands at `where`, the subject of whatever is said of it."""
-        return _plain(lambda: self._checked(_json(text)), f"{where} is not {self.what}")
+        return _plain(lambda: self._checked(self._load(text)), f"{where} is not {self.what}")
+
+    def _load(self, text: str) -> Any:
+        return _json(text)
 
     def _checked(self, value: Any) -> Kind:
         from pydantic import ValidationError
@@ -150,14 +154,13 @@ def _bounded(number: int) -> int:
 
 
 class Loader(yaml.SafeLoader):
-    """YAML of settings. A key that stands twice is refused, of which PyYAML keeps the last.
+    """Loads YAML of settings. A key that stands twice is refused; PyYAML would keep the last value.
 
-    Whatever YAML 1.1 alone takes for something else is text, as in YAML 1.2: 010 (eight), 1:30 (ninety), dates, and
-    yes, no, on and off.
+    As in YAML 1.2, these are text: 010 (eight in YAML 1.1), 1:30 (ninety), dates, and yes, no, on and off.
     """
 
     own_tags: frozenset[str] = frozenset()
-    """Tags that are read; YAML's own, `!!int '010'`, would say what the text does not."""
+    """Tags that are read. YAML's own are refused, because `!!int '010'` contradicts its text."""
 
     yaml_implicit_resolvers = deepcopy(yaml.SafeLoader.yaml_implicit_resolvers)
 
@@ -193,14 +196,14 @@ KEPT = {
     "tag:yaml.org,2002:float": r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan",
     "tag:yaml.org,2002:timestamp": "(?!)",
 }
-"""What is taken for a truth value, a number or a date."""
+"""The plain texts that are read as a truth value, a number or a date."""
 
 for resolvers in Loader.yaml_implicit_resolvers.values():
     resolvers[:] = [(tag, re.compile(f"(?:{KEPT[tag]})\\Z") if tag in KEPT else rule) for tag, rule in resolvers]
 
 
 def _count(node: yaml.Node, counted: dict[int, int]) -> int:
-    """The values that a node stands for. What it holds itself, which YAML allows, counts as too many."""
+    """The number of values that a node stands for. A node that holds itself, which YAML allows, has too many."""
     if id(node) not in counted:
         counted[id(node)] = MOST_VALUES + 1
         parts = node.value if isinstance(node, yaml.CollectionNode) else ()
@@ -214,16 +217,14 @@ class Yaml[Kind](Json[Kind]):
     """Files of YAML of one kind.
 
     Args:
-        loader: with what tags, if with any.
+        loader: the class that decides which tags are read.
     """
 
     loader: type[Loader] = Loader
+    most: ClassVar[int] = MOST_YAML
 
-    def read(self, path: Path) -> Kind:
-        return self.parse(read_text(path, MOST_YAML), f"'{path}'")
-
-    def parse(self, text: str, where: str) -> Kind:
-        return _plain(lambda: self._checked(_yaml(text, self.loader)), f"{where} is not {self.what}")
+    def _load(self, text: str) -> Any:
+        return _yaml(text, self.loader)
 
 
 def parse_yaml(text: str, where: str, loader: type[Loader] = Loader) -> Any:
@@ -236,13 +237,13 @@ def _yaml(text: str, loader: type[Loader]) -> Any:
 
 
 def _whole(value: Any) -> Any:
-    """A value that can be written."""
+    """Return a value whose text can be encoded. Raises UnicodeEncodeError: it holds half of a character."""
     json.dumps(value, ensure_ascii=False, default=str).encode()
     return value
 
 
 def _plain[Value](parse: Callable[[], Value], failing: str) -> Value:
-    """What `parse` returns; what it raises is one sentence, which begins with `failing`."""
+    """Return what `parse` returns, and turn its errors into one sentence that begins with `failing`."""
     try:
         return parse()
     except RecursionError:
@@ -295,7 +296,7 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None, most: int | N
 
 @contextmanager
 def bounded_memory(more: int) -> Iterator[None]:
-    """Let this process take at most `more` bytes than it has: a page that unpacks to gigabytes is a `MemoryError`."""
+    """Limit this process to `more` bytes beyond those that it has; more than that is a `MemoryError`."""
     if sys.platform != "linux":
         yield
         return

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from multiprocessing import parent_process
 
 from lerobot_constructskill.errors import first_line
@@ -21,27 +21,16 @@ def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
     Args:
         kind: the class of a row.
     """
-    for point in sorted(entry_points(group=GROUP), key=lambda point: (_package(point), point.name)):
+    points = [(point.dist.name if point.dist else point.module, point) for point in entry_points(group=GROUP)]
+    for package, point in sorted(points, key=lambda pair: (pair[0], pair[1].name)):
         try:
-            rows = _load(point, kind)
+            found = point.load()
+            rows = [found] if isinstance(found, kind) else list(found)
+            if strange := [row for row in rows if not isinstance(row, kind)]:
+                raise TypeError(f"it holds {strange[0]!r:.100}, not a {kind.__name__}")
         except (Exception, SystemExit) as error:  # whatever the code of another package may raise
             if parent_process() is None:  # workers would repeat it
-                logger.warning("The tasks of the package '%s' are left out: %s", _package(point), _said(point, error))
+                fails = f"{point.name} = {point.value} fails ({type(error).__name__}: {first_line(error)})"
+                logger.warning("The tasks of the package '%s' are left out: its entry point %s.", package, fails)
             continue
-        yield from ((_package(point), row) for row in rows)
-
-
-def _load[Row](point: EntryPoint, kind: type[Row]) -> list[Row]:
-    found = point.load()
-    rows = [found] if isinstance(found, kind) else list(found)
-    if strange := [row for row in rows if not isinstance(row, kind)]:
-        raise TypeError(f"it holds {strange[0]!r:.100}, not a {kind.__name__}")
-    return rows
-
-
-def _package(point: EntryPoint) -> str:
-    return point.dist.name if point.dist else point.module
-
-
-def _said(point: EntryPoint, error: Exception) -> str:
-    return f"its entry point {point.name} = {point.value} fails ({type(error).__name__}: {first_line(error)})."
+        yield from ((package, row) for row in rows)

@@ -1,30 +1,28 @@
-"""Configurations by draccus, from flags, files and plain values; what it cannot read is the user's to mend."""
+"""Makes configurations of flags, files and plain values by draccus; each refusal is one sentence for the user."""
 
 import argparse
 import os
 import shlex
-import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
-from types import NoneType, UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import draccus
 import mergedeep
+import yaml
 
-from lerobot_constructskill import tags
-from lerobot_constructskill.bounds import LONGEST, NAMES
-from lerobot_constructskill.errors import FieldError, InputError
-from lerobot_constructskill.files import Json, parse_yaml
+from lerobot_constructskill.bounds import UNIONS, allows, refusal
+from lerobot_constructskill.errors import FieldError, InputError, UserError
+from lerobot_constructskill.files import Json, Loader, Yaml, parse_yaml
 from lerobot_constructskill.lerobot_internals import ArgumentParser
 from lerobot_constructskill.presets import find
 
-OURS = Path(__file__).parent
-
-CONFIGURATION = Json("a configuration")
-"""One in JSON; one in YAML may have our tags."""
+TEXTS = {str, Path, NoneType}
+"""Types of fields whose flags are taken as text, as they were written."""
 
 
 def parse[Config](
@@ -39,10 +37,8 @@ def parse[Config](
         InputError: they do not make a configuration.
         MissingError: there is no such file, or a `!policy` in it names no shipped policy.
     """
-    named, flags = _take_config_path(flags)
     with as_input():
-        path = config_path if named is None else named
-        return Parser(config_class, path, exit_on_error=False, epilog=epilog).parse_args(flags)
+        return Parser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
 
 
 def parse_named[Config](config_class: type[Config], kind: str, text: str, flags: Sequence[str] = ()) -> Config:
@@ -59,26 +55,17 @@ def parse_named[Config](config_class: type[Config], kind: str, text: str, flags:
     """
     with as_input():
         name, *own = shlex.split(text) or [""]
-    if {"-h", "--help"} & {*own}:
-        raise InputError(f"'{text}' asks for help, and is no configuration.")
     return parse(config_class, [*flags, *own], find(kind, name))
 
 
-def _take_config_path(flags: Sequence[str]) -> tuple[str | None, list[str]]:
-    """The value of `--config_path`, and the other flags."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    parser.add_argument("--config_path")
-    with as_input():
-        taken, others = parser.parse_known_args(flags)
-    return taken.config_path, others
-
-
 class Parser(ArgumentParser):
-    """draccus' parser of flags, but their values and the file are read as `files.Loader` reads."""
+    """draccus' parser of flags, which reads their values and the file by our own loaders."""
 
     def _postprocessing(self, flags: argparse.Namespace) -> Any:
-        said = {name: _value(text, _kind_of(self.config_class, name)) for name, text in vars(flags).items()}
-        read = {} if self.config_path is None else _read(Path(self.config_path))
+        texts = {"config_path": self.config_path} | vars(flags)
+        path = texts.pop("config_path")
+        said = {name: _value(text, _kind_of(self.config_class, name)) for name, text in texts.items()}
+        read = {} if path is None else read_fields(Path(path))
         return decode(self.config_class, mergedeep.merge(read, draccus.utils.deflatten(said, sep=".")))
 
 
@@ -86,12 +73,19 @@ def _kind_of(config_class: type, name: str) -> Any:
     """The annotation of a field that a flag names, `noise.sigma` for instance."""
     kind: Any = config_class
     for part in name.split("."):
-        kind = next((get_type_hints(one).get(part, Any) for one in _alternatives(kind) if is_dataclass(one)), Any)
+        kind = next(
+            (
+                get_type_hints(one, include_extras=True).get(part, Any)
+                for one in _alternatives(kind)
+                if is_dataclass(one)
+            ),
+            Any,
+        )
     return kind
 
 
 def _value(text: str, kind: Any) -> Any:
-    """A flag's value is YAML, or text where it is none: `--only=*/seed_0` is no alias. Where text belongs, it is text.
+    """The value of a flag: its text, where the field is text or where the text is no YAML, or what it is in YAML.
 
     `~/` is the home folder; a shell does not replace it behind an equals sign.
     """
@@ -104,11 +98,41 @@ def _value(text: str, kind: Any) -> Any:
         return text
 
 
-def _read(path: Path) -> dict[str, Any]:
-    read = CONFIGURATION.read(path) if path.suffix == ".json" else tags.read(path)
-    if not isinstance(read, dict):
-        raise InputError(f"'{path}' is empty or is not a mapping of fields.")
-    return read
+class ConfigurationLoader(Loader):
+    """YAML of our configuration files, in which `!policy` stands for the fields of a shipped policy.
+
+    `!policy precise` stands for the fields of `configs/policy/precise.yaml`; `!policy {preset: precise, camera: base}`
+    for the same fields with another value. The tag opens no other file, and other loaders refuse it.
+    """
+
+    own_tags = frozenset({"!policy"})
+
+
+def _policy(loader: ConfigurationLoader, node: yaml.Node) -> dict[str, Any]:
+    if isinstance(node, yaml.ScalarNode):
+        name, fields = node.value, {}
+    else:
+        fields = loader.construct_mapping(node, deep=True)
+        if "preset" not in fields:
+            raise InputError("`!policy {…}` must name the policy that it starts from, such as `preset: precise`.")
+        name = fields.pop("preset")
+    return read_fields(find("policy", str(name), or_file=False)) | fields
+
+
+ConfigurationLoader.add_constructor("!policy", _policy)
+
+YAML = Yaml("a configuration, a mapping of fields", loader=ConfigurationLoader)
+JSON = Json("a configuration, a mapping of fields")
+
+
+def read_fields(path: Path) -> dict[str, Any]:
+    """The fields of a configuration file as plain values.
+
+    Raises:
+        MissingError: there is no such file, or a `!policy` in it names no shipped policy.
+        InputError: it is not what `files.Loader` reads, no mapping, or a `!policy` in it names no policy.
+    """
+    return (JSON if path.suffix == ".json" else YAML).read(path)
 
 
 def tells_of_bases[Config](config_class: type[Config]) -> type[Config]:
@@ -122,110 +146,80 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
     """Make a configuration of plain values.
 
     Raises:
-        InputError: they do not make one.
+        InputError: they do not make one, or draccus would turn one of them into something else.
     """
     with as_input():
-        check_kinds(config_class, values)
-        return draccus.decode(config_class, values)
+        try:
+            made = draccus.decode(config_class, values)
+        except draccus.utils.DecodingError as error:
+            name, found = ".".join(error.key_path), values
+            for part in error.key_path:
+                found = found.get(part) if isinstance(found, Mapping) else None
+            if allows(kind := _kind_of(config_class, name), found):
+                raise
+            raise InputError(refusal(name, kind, found)) from None
+        check_same(made, values)
+        return made
 
 
-def check_kinds(kind: Any, value: Any, name: str = "") -> None:
-    """Refuse what draccus turns into something else: true into 1, 1.10 into the text "1.1", [] into all defaults.
+def check_same(made: Any, given: Any, name: str = "", kind: Any = Any) -> None:
+    """Refuse plain values that draccus has turned into others: true into 1, 1.10 into "1.1", [] into all defaults.
+
+    A value of the default's type is right whatever the annotation says: LeRobot annotates some truth values as int.
+
+    Args:
+        made: what draccus made.
+        given: what it was made of.
+        name: of the field.
+        kind: the field's annotation.
 
     Raises:
         InputError: the message names the field.
     """
-    kinds = [*_alternatives(kind)]
-    if isinstance(value, Mapping) and (chosen := [one for one in kinds if hasattr(one, "get_choice_class")]):
-        known = chosen[0].get_known_choices()
-        kinds = [known[value["type"]]] if value.get("type") in known else [Any]
-        value = {field: one for field, one in value.items() if field != "type"}
-    if all(map(_is_plain, kinds)) and not any(_fits(one, value) for one in kinds):
-        wanted = " or ".join(dict.fromkeys(_WANTED.get(get_origin(one) or one, "a mapping") for one in kinds))
-        hint = " (put it in quotation marks)" if TEXTS & {*kinds} and not isinstance(value, list | Mapping) else ""
-        raise InputError(f"{name} must be {wanted.removesuffix(' or nothing')}, not {repr(value)[:LONGEST]}{hint}.")
-    for one in kinds:
-        of = get_args(one) or (Any,)
-        if isinstance(value, Mapping) and is_dataclass(one):
-            hints = _hints(one)
-            inner = [(hints[field], each, field) for field, each in value.items() if field in hints]
-        elif isinstance(value, Mapping):
-            inner = [(of[-1], each, field) for field, each in value.items()]
-        else:
-            inner = [(of[0], each, "") for each in value] if isinstance(value, list) else []
-        for kind_of, each, field in inner:
-            check_kinds(kind_of, each, ".".join(filter(None, (name, str(field)))))
+    if is_dataclass(made) and isinstance(given, Mapping):
+        hints = get_type_hints(type(made), include_extras=True)
+        for one in fields(made):
+            if one.name in given and type(given[one.name]) is not type(one.default):
+                check_same(getattr(made, one.name), given[one.name], f"{name}.{one.name}".lstrip("."), hints[one.name])
+    elif isinstance(made, Mapping) and isinstance(given, Mapping):
+        for key in made.keys() & given.keys():
+            check_same(made[key], given[key], f"{name}.{key}")
+    elif isinstance(made, list | tuple) and isinstance(given, list | tuple):
+        for one, item in zip(made, given, strict=False):
+            check_same(one, item, name, kind)
+    elif made is not None and given is not None and not _is_same(made, given):
+        hint = " Put it in quotation marks." if isinstance(made, str | Path) and isinstance(given, int | float) else ""
+        raise InputError(refusal(name, kind, given) + hint)
 
 
-def _hints(config_class: type) -> dict[str, Any]:
-    """The kinds of its fields, that of the default among them: LeRobot calls some truths whole numbers."""
-    hints = get_type_hints(config_class)
-    given = {one.name: type(one.default) for one in fields(config_class) if one.default is not MISSING}
-    own = {one.name: hints[one.name] for one in fields(config_class)}
-    return {name: Union[kind, given.get(name, kind)] for name, kind in own.items()}  # noqa: UP007
-
-
-TEXTS = {str, Path, NoneType}
-_WANTED = NAMES | {float: "a number", NoneType: "nothing", list: "a list", tuple: "a list"}
-"""What a value of a kind is called; others are mappings. Whether a number is finite is for `bounds`."""
-
-
-def _is_plain(kind: Any) -> bool:
-    return kind in (*_WANTED, dict) or get_origin(kind) in (list, tuple, dict) or is_dataclass(kind)
-
-
-def _fits(kind: Any, value: Any) -> bool:
-    """Whether a value of YAML or JSON is of a plain kind. 1e-4 is text in YAML."""
-    match value:
-        case None:
-            return not is_dataclass(kind)
-        case bool():
-            return kind is bool
-        case int():
-            return kind in (int, float)
-        case float():
-            return kind is float
-        case str():
-            return kind in TEXTS or (kind is float and _is_number(value))
-        case list() | tuple():
-            return (get_origin(kind) or kind) in (list, tuple)
-        case Mapping():
-            return is_dataclass(kind) or (get_origin(kind) or kind) is dict
-    return True
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+def _is_same(made: Any, given: Any) -> bool:
+    if isinstance(made, Path | Enum):
+        return isinstance(given, str)
+    return type(given) in ((int, float, str) if isinstance(made, float) else (type(made),))
 
 
 def _alternatives(kind: Any) -> Iterable[Any]:
-    if get_origin(kind) in (Union, UnionType):
+    if get_origin(kind) is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if get_origin(kind) in UNIONS:
         return (one for each in get_args(kind) for one in _alternatives(each))
     return (kind,)
 
 
 @contextmanager
 def as_input() -> Iterator[None]:
-    """Turn what the block raises into an `InputError`, but for `OSError` and for errors of our own configurations."""
+    """Turn the errors of draccus, argparse and YAML into an `InputError`; our own errors and `OSError` pass."""
     try:
         yield
     except (OSError, InputError):
         raise
-    except FieldError as error:
-        raise InputError(str(error)) from None
     except (TypeError, AttributeError):  # draccus merges fields, and copies them, before it looks at them
         raise InputError("The configuration's file is empty or is not a mapping of fields.") from None
-    except Exception as error:  # those of draccus, argparse and YAML have no base in common
+    except Exception as error:  # these have no base class in common
         root = error
         while root.__cause__ is not None:
             root = root.__cause__
-        if isinstance(root, FieldError):
-            raise InputError(str(root)) from None
-        refusals = [frame for frame in traceback.extract_tb(root.__traceback__) if frame.name == "__post_init__"]
-        if refusals and Path(refusals[-1].filename).is_relative_to(OURS):
-            raise root from None  # a configuration of ours, which refuses the values or is broken itself
-        raise InputError(str(error if isinstance(error, draccus.utils.DecodingError) else root)) from error
+        if isinstance(root, FieldError) or not isinstance(root, UserError | OSError):
+            said = error if isinstance(error, draccus.utils.DecodingError) else root
+            raise InputError(str(said)) from error
+        raise root from None

@@ -1,6 +1,6 @@
-"""The one door to the configuration of a policy, of plain fields or of a checkpoint, whoever wrote the policy.
+"""Reads the configuration of a policy of any installed package, from plain fields or from a checkpoint.
 
-All plugins that are installed are imported first, so a command that reads a policy knows the types of others.
+All installed plugins are imported first, because they register the types of policies.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from lerobot.utils import auto_select_torch_device
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import load_plugins
-from lerobot_constructskill.parsing import as_input, check_kinds, decode
+from lerobot_constructskill.parsing import as_input, check_same, decode
 
 CONFIGURATION = Json("a policy's configuration")
 
@@ -42,19 +42,16 @@ def read_policy(checkpoint: Path | str, **overrides: Any) -> PreTrainedConfig:
     """
     load_plugins()
     flags = [f"--{name}={value}" for name, value in overrides.items() if value is not None]
-    if (file := Path(checkpoint) / "config.json").exists():
-        saved = CONFIGURATION.read(file)
-        try:
-            check_kinds(PreTrainedConfig, saved)
-        except InputError as error:
-            raise InputError(f"'{file}': {error}") from None
+    saved = CONFIGURATION.read(file) if (file := Path(checkpoint) / "config.json").exists() else {}
     with as_input():
         try:
-            return PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
+            config = PreTrainedConfig.from_pretrained(checkpoint, cli_overrides=flags)
         except ValueError as error:
             if isinstance(error.__cause__, KeyError):  # of LeRobot's registry
                 raise _unknown(error.__cause__.args[0]) from error
             raise
+        check_same(config, saved, f"'{file}': policy")
+    return config
 
 
 def _unknown(kind: str) -> InputError:

@@ -1,4 +1,4 @@
-"""The configurations that are shipped, found by name: `fast`, `suite/block_to_bin`, `paper`. Standard library only."""
+"""Finds the shipped configurations by name: `fast`, `suite/block_to_bin`, `paper`. Standard library only."""
 
 import re
 from pathlib import Path
@@ -18,33 +18,25 @@ def names(kind: str) -> list[str]:
     return sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
 
 
-def named(kind: str, name: str) -> Path:
+def find(kind: str, name: str | Path, or_file: bool = True) -> Path:
     """The file of a shipped configuration.
 
-    Raises:
-        MissingError: there is no such name.
-    """
-    if name not in names(kind):
-        raise MissingError(f"There is no {kind} configuration '{name}'; {_listed(kind)}")
-    return FOLDER / kind / f"{name}.yaml"
-
-
-def find(kind: str, name_or_path: str | Path) -> Path:
-    """The file of a shipped configuration, or the file that was given; a name wins over a file called like it.
+    Args:
+        kind: one of `KINDS`.
+        name: of the configuration.
+        or_file: whether `name` may also be a file; a configuration wins over a file of the same name.
 
     Raises:
         MissingError: there is neither such a name nor such a file.
     """
-    name = str(name_or_path)
-    if name in names(kind):
-        return named(kind, name)
-    if Path(name).is_file():
+    if str(name) in names(kind):
+        return FOLDER / kind / f"{name}.yaml"
+    if or_file and Path(name).is_file():
         return Path(name)
-    raise MissingError(f"There is no file and no {kind} configuration '{name}'; {_listed(kind)}")
-
-
-def _listed(kind: str) -> str:
-    return f"the configurations are: {', '.join(names(kind))}."
+    missing = "no file and no" if or_file else "no"
+    raise MissingError(
+        f"There is {missing} {kind} configuration '{name}'; the configurations are: {', '.join(names(kind))}."
+    )
 
 
 def description(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""The bars of everything that takes long: on a terminal their clocks move every second, a log gets fewer lines."""
+"""Progress bars: on a terminal their clocks move every second, in a log they print few lines."""
 
 import sys
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ TICK_S, LOG_INTERVAL_S = 1, 5
 
 
 class Progress(tqdm):
-    """A `tqdm` that waits for no piece of work to show that it lives; inside another bar it goes when it has finished.
+    """A `tqdm` whose clock moves during long pieces of work; a bar inside another disappears when it has finished.
 
-    Its time to go is that of the average piece so far: ours take from milliseconds to minutes, and come in bursts, one
-    from each worker, where an average of the last few would promise something else every time.
+    The remaining time is estimated from the average of all pieces so far. Pieces take from milliseconds to minutes and
+    come in bursts, one from each worker, so that an average of the last few would jump.
     """
 
     def __init__(self, *args, smoothing: float = 0, leave: bool | None = None, **options):
@@ -39,7 +39,7 @@ class Progress(tqdm):
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep what LeRobot and FFmpeg print from among our lines: a bar for each step, and how a codec fared."""
+    """Silence LeRobot's bars and FFmpeg's messages about its codecs."""
     import av
 
     av.logging.set_libav_level(av.logging.ERROR)

@@ -16,7 +16,7 @@ from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoPro
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
-from lerobot_constructskill.scripts.config import TrainingFile, write
+from lerobot_constructskill.scripts.config import ConfigConfig, write
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
 
 pytestmark = [pytest.mark.sim, pytest.mark.nightly]
@@ -106,7 +106,7 @@ def trained(request, folder, demonstrations):
     """Name of a policy and its checkpoint after two steps of `lerobot-train` on the shipped configuration."""
     kind, out = request.param, folder / request.param
     base = [f"--policy.path={request.getfixturevalue('smolvla_base')}"] if kind == "smolvla" else []
-    written = write(TrainingFile(kind, Path(demonstrations[0].split("=")[1])))
+    written = write(ConfigConfig(f"train/{kind}", Path(demonstrations[0].split("=")[1])))
     flags = [f"--config_path={written}", *demonstrations, *base, *SMALL[kind], *QUICK, "--batch_size=2"]
     log = call("lerobot-train", *flags, "--steps=2", "--eval_steps=2", "--max_eval_samples=2", f"--output_dir={out}")
     assert "eval_loss=" in log

@@ -1,8 +1,6 @@
 """The checking command of a new task."""
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.scripts.check_task import CheckTaskConfig, check_task
@@ -11,19 +9,17 @@ from lerobot_constructskill.scripts.check_task import CheckTaskConfig, check_tas
 @pytest.mark.parametrize("bad", [{"task": "lintel"}, {"task": "brick_to_bin", "states": 0}])
 def test_bad_input_is_refused(bad):
     with pytest.raises(ValueError, match="lintel|states"):
-        CheckTaskConfig(**bad)
+        check_task(CheckTaskConfig(**bad))
 
 
 @pytest.mark.sim
-def test_a_good_task_is_reported_with_its_interval_and_a_sheet(tmp_path):
-    report = check_task(CheckTaskConfig("block_to_bin", states=2, folder=tmp_path, tests=False))
+def test_a_good_task_is_reported_with_its_interval():
+    report = check_task(CheckTaskConfig("block_to_bin", states=2))
     assert "2 of 2" in report and "15.8%" in report
-    assert np.asarray(Image.open(tmp_path / "block_to_bin.png")).std() > 10
 
 
 @pytest.mark.sim
-def test_an_expert_that_fails_fails_the_check_and_names_the_seeds(tmp_path):
+def test_an_expert_that_fails_fails_the_check_and_names_the_seeds():
     drops = ExpertConfig(lift_height=0.01, release_clearance=-0.1)
-    config = CheckTaskConfig("brick_to_bin_turned", states=1, folder=tmp_path, tests=False, expert=drops)
     with pytest.raises(ValueError, match=r"0 of 1 .* seeds \[1000000\]"):
-        check_task(config)
+        check_task(CheckTaskConfig("brick_to_bin_turned", states=1, expert=drops))

@@ -17,16 +17,16 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from metadata import write_metadata
 
 import lerobot_constructskill.plugin  # noqa: F401
-from lerobot_constructskill import presets, tags
+from lerobot_constructskill import presets
 from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
-from lerobot_constructskill.parsing import parse, parse_named
+from lerobot_constructskill.parsing import parse, parse_named, read_fields
 from lerobot_constructskill.perturbations import AXES
 from lerobot_constructskill.policies.frozen_vit.backbones import BACKBONES
-from lerobot_constructskill.scripts.config import TrainingFile, write
+from lerobot_constructskill.scripts.config import ConfigConfig, show_or_write, write
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import VARIANT
@@ -251,7 +251,9 @@ def written(tmp_path):
 
     def write_for(name: str, n: int = 80, **options) -> Path:
         root = tmp_path / f"set_{n}"
-        return write(TrainingFile(name, root if root.exists() else write_metadata(root, [104] * n), **options))
+        return write(
+            ConfigConfig(f"train/{name}", root if root.exists() else write_metadata(root, [104] * n), **options)
+        )
 
     return write_for
 
@@ -294,7 +296,7 @@ def test_passes_are_counted_in_frames_that_are_trained_on(written):
 @pytest.mark.parametrize("name", TRAIN)
 def test_what_is_written_is_plain_yaml_with_every_field_of_the_policy(name, written, tmp_path):
     file = written(name, out=tmp_path / "mine" / "file.yaml")
-    template, fields = tags.read(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
+    template, fields = read_fields(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
     assert file == tmp_path / "mine" / "file.yaml" and fields["policy"] == template["policy"]
     assert not {"passes", "checkpoints"} & fields.keys()
 
@@ -320,16 +322,19 @@ def test_a_set_in_lerobots_cache_or_on_the_hub_is_named_alone(tmp_path, monkeypa
     monkeypatch.setattr(
         "lerobot_constructskill.dataset.hub.locate", lambda *_: write_metadata(tmp_path / "c", [9] * 8)
     )
-    file = write(TrainingFile("act", repo_id="alice/bricks"))
+    file = write(ConfigConfig("train/act", repo_id="alice/bricks"))
     dataset = yaml.safe_load(file.read_text())["dataset"]
-    assert file == Path("outputs/bricks_act.yaml") and dataset["repo_id"] == "alice/bricks" and "root" not in dataset
+    assert file == tmp_path / "outputs/bricks_act.yaml"
+    assert dataset["repo_id"] == "alice/bricks" and "root" not in dataset
 
 
 def test_training_is_written_for_a_set_alone():
     with pytest.raises(InputError, match="train/act is written for a data set: add --root=FOLDER"):
-        TrainingFile("act")
-    with pytest.raises(MissingError, match="no train configuration 'atc'; the configurations are: act, "):
-        TrainingFile("atc", Path("anywhere"))
+        write(ConfigConfig("train/act"))
+    with pytest.raises(MissingError, match="no configuration 'train/atc'; the configurations are: .*train/act, "):
+        write(ConfigConfig("train/atc", Path("anywhere")))
+    with pytest.raises(InputError, match="Flags are for configurations of train/"):
+        show_or_write(ConfigConfig("study/paper", Path("anywhere")))
 
 
 def test_the_tag_has_no_meaning_for_others():

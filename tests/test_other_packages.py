@@ -58,8 +58,7 @@ def test_worker_processes_know_the_guides_task(installed, tmp_path):
 @pytest.mark.slow
 def test_the_guides_task_is_checked_and_recorded_without_a_checkout(installed, tmp_path):
     task, path = "--task=lintel_to_wall", {"PYTHONPATH": str(installed)}
-    quick = ["--states=1", "--tests=false", f"--folder={tmp_path}"]
-    checked = call(BIN / "constructskill-check-task", task, *quick, **path)
+    checked = call(BIN / "constructskill-check-task", task, "--states=1", **path)
     assert "lintel_to_wall: the expert succeeds in 1 of 1 initial states" in checked
     size = ["--episodes=1", "--repo_id=local/lintel", f"--root={tmp_path / 'lintel'}"]
     call(BIN / "constructskill-generate", "smoke", task, *size, **path)

@@ -19,7 +19,7 @@ from printed import PAGES, ROOT, commands, spans
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.presets import find
-from lerobot_constructskill.scripts.config import TrainingFile, write
+from lerobot_constructskill.scripts.config import ConfigConfig, write
 
 OURS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 THEIRS = {"lerobot-train": TrainPipelineConfig, "lerobot-eval": EvalPipelineConfig}
@@ -71,7 +71,7 @@ def configured(call: str, folder: Path) -> str:
     if kind != "train":
         return str(find(kind, name))
     assert [flag.partition("=")[0] for flag in flags] == ["--root"]
-    return str(write(TrainingFile(name, write_metadata(folder / "set", [100] * 9))))
+    return str(write(ConfigConfig(f"train/{name}", write_metadata(folder / "set", [100] * 9))))
 
 
 def entry_point(name: str) -> Callable[[], None]:

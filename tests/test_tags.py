@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from lerobot_constructskill import tags
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.parsing import read_fields
 
 NAMES = "abcdefgh"
 TENFOLD = "".join(f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n" for before, name in pairwise(NAMES))
@@ -25,10 +25,10 @@ TENFOLD = "".join(f"{name}: &{name} [{', '.join([f'*{before}'] * 10)}]\n" for be
 def test_what_would_be_lost_or_too_much_is_refused_in_one_sentence(text, said, tmp_path):
     (tmp_path / "mine.yaml").write_text(text)
     with pytest.raises(InputError, match=said) as refused:
-        tags.read(tmp_path / "mine.yaml")
+        read_fields(tmp_path / "mine.yaml")
     assert str(refused.value).startswith(f"'{tmp_path / 'mine.yaml'}'") and "\n" not in str(refused.value)
 
 
 def test_anchors_and_merge_keys_are_for_saying_a_thing_once(tmp_path):
     (tmp_path / "mine.yaml").write_text("base: &base {a: 1, b: 2}\nmine:\n  <<: *base\n  a: 3\n")
-    assert tags.read(tmp_path / "mine.yaml")["mine"] == {"a": 3, "b": 2}
+    assert read_fields(tmp_path / "mine.yaml")["mine"] == {"a": 3, "b": 2}

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 import yaml
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies import PreTrainedPolicy
 
 from lerobot_constructskill.artifacts.digests import installed
 from lerobot_constructskill.dagger.plan import Plan
@@ -21,7 +20,6 @@ from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.scripts.fit_noise import FitNoiseConfig, fit_noise
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
-from lerobot_constructskill.scripts.push_policy import _push
 from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, study
 from lerobot_constructskill.scripts.submit import SubmitConfig, submit
@@ -147,28 +145,12 @@ def read_to_fit_noise(checkpoint: Path, demonstrations: Path, out: Path) -> None
     )
 
 
-def read_to_push(checkpoint: Path, demonstrations: Path, out: Path) -> None:
-    """As far as LeRobot's own push."""
-    from lerobot_constructskill.scripts.push_policy import PushPolicyConfig
-
-    pushed = []
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(InterruptedError):
-        patch.setattr(PreTrainedPolicy, "push_model_to_hub", lambda policy, told: interrupt(pushed, policy, told))
-        _push(PushPolicyConfig(checkpoint, out, "me/mine", ENV["task"]), "", "cpu")
-    assert pushed == [(TYPE, TYPE)]
-
-
-def interrupt(pushed: list, policy, told) -> None:
-    pushed.append((policy.name, told.policy.type))
-    raise InterruptedError
-
-
 def read_to_drive(checkpoint: Path, demonstrations: Path, out: Path) -> None:
     """As far as the plan of its rounds."""
     assert Plan.of(DaggerConfig("local/driven", {"type": TYPE})).learner.config.type == TYPE
 
 
-@pytest.mark.parametrize("command", [read_offline, read_to_fit_noise, read_to_push, read_to_drive])
+@pytest.mark.parametrize("command", [read_offline, read_to_fit_noise, read_to_drive])
 def test_a_command_that_reads_a_policy_knows_that_of_a_plugin(command, checkpoint, demonstrations, tmp_path):
     command(checkpoint, demonstrations, tmp_path)
 

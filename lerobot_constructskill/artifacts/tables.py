@@ -1,4 +1,4 @@
-"""Parquet files of one kind, whose columns are the fields of a dataclass."""
+"""Reads Parquet files whose columns are the fields of a dataclass."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -13,7 +13,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json, read_parquet
 
 MOST = 256 << 20
-"""Bytes of a table of one kind, unpacked."""
+"""Bytes that a table may have, unpacked."""
 
 VERSIONS = Json("versions, package to version", dict[str, str])
 
@@ -22,12 +22,12 @@ _ARROW = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_
 
 @dataclass(frozen=True)
 class Parquet:
-    """Parquet files whose columns are a dataclass' fields, of which those that may be None may be null.
+    """Parquet files whose columns are the fields of a dataclass; a field that may be None may be null.
 
     Args:
         what: what such a file is called, with its article.
         kind: the dataclass.
-        types: of its fields that are no str, int, float or bool.
+        types: Arrow's type of each annotation that is no str, int, float or bool.
         later: columns that earlier versions did not have; they are read as null.
         json: columns that hold JSON.
     """
@@ -47,7 +47,7 @@ class Parquet:
         return next(kinds[kind] for kind in (annotation, *get_args(annotation)) if kind in kinds)
 
     def read(self, path: Path) -> pa.Table:
-        """A file's rows, of which there is one at least.
+        """The rows of a file, at least one.
 
         Raises:
             MissingError: there is no such file.

@@ -18,9 +18,8 @@ from lerobot_constructskill.artifacts.store import Machine, Node
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.rounds import DRIVEN, DRIVING, OUTCOMES, Round, totals
 from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
-from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
-from lerobot_constructskill.demos.modality import write_meanings
+from lerobot_constructskill.demos.metadata import file_hashes, write_meanings
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.progress import quiet
 

@@ -1,1 +1,1 @@
-"""What one does with a data set that is there: checks, card, replay, plots, Hub."""
+"""Reads finished data sets: checks, card, plots, Hub."""

@@ -1,20 +1,29 @@
 """A data set's card: its README.md on the Hub, rendered from the data and the contract table."""
 
+import json
+import re
+from importlib.resources import files
 from typing import Annotated, Any
 
 import numpy as np
 
-from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_values
+from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_fields
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
-from lerobot_constructskill.dataset import markdown
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.interface import describe_task
 
-Version = Annotated[str, Pattern(r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}|[\w.+!-]{1,64}", "a version")]
-"""Of a package, and of one whose source is told as well (`artifacts/code.py`)."""
+Version = Annotated[
+    str,
+    Pattern(
+        r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}(?:, edited: [\w./, -]{1,999})?|[\w.+!-]{1,64}",
+        "a version",
+    ),
+]
+"""The version of a package, or what `artifacts/code.py` says of one whose source is hashed."""
+
 
 MEANINGS = {
     "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",
@@ -44,14 +53,17 @@ ADVISED = {
     "dart.noise": "executed translation minus the expert's clean one, in DAgger's rounds minus the advised one, m",
     "phase": "the expert's phase, in a demonstration that of what it did itself and not of the advice",
 }
-"""What they are where `action` is the expert's advice."""
+"""Other meanings, for data sets whose `action` is the expert's advice."""
+
+ACTIVE = re.compile(r"[\x00-\x1f`]|\]\(")
+"""Characters that would end a line, a piece of code or a link's name; HTML is escaped too."""
 
 TURNS = "; turns in rad about the same axes, right-handed"
-"""What an action also is in a task that turns."""
+"""What follows the meaning of an action in a task that turns."""
 
 
-class Provenance:
-    """What cards and checks read of `meta/constructskill.json`, beside the configuration."""
+class SidecarFields:
+    """The fields of `meta/constructskill.json` that cards and checks read, beside the configuration."""
 
     attempts: Count
     discarded_seeds: list[Seed]
@@ -61,12 +73,12 @@ class Provenance:
 
 
 def card_facts(data: DataSet) -> dict[str, Any]:
-    """The facts of a card: plain values, so that they can be kept beside it and compared with the data later.
+    """The facts of a card as plain values, which can be kept in JSON and compared with the data later.
 
     Raises:
-        InputError: the data set says of itself what none can.
+        InputError: a field of the data set's metadata has an impossible value.
     """
-    check_values(Provenance, data.facts, f"{SIDECAR}: ")
+    check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:
@@ -121,7 +133,7 @@ def render(facts: dict[str, Any]) -> str:
         features = as_before_joints(features)
     cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
-    return markdown.render(
+    return render_template(
         "card.md.j2",
         **facts,
         task=task,
@@ -140,8 +152,19 @@ def render(facts: dict[str, Any]) -> str:
 
 def _rename_map(keys: list[str]) -> dict[str, str]:
     """Our cameras under the names that SmolVLA's and pi0's base models expect."""
-    import json
-
     smolvla = {key: f"observation.images.camera{index + 1}" for index, key in enumerate(keys)}
     pi0 = dict(zip(keys, ("observation.images.base_0_rgb", "observation.images.left_wrist_0_rgb"), strict=False))
     return {"smolvla": json.dumps(smolvla), "pi0": json.dumps(pi0)}
+
+
+def render_template(template: str, **facts: Any) -> str:
+    """A template of this folder with its facts filled in, as text only: anybody may have written their files."""
+    from jinja2 import Environment, StrictUndefined
+
+    layout = {"trim_blocks": True, "lstrip_blocks": True}
+    environment = Environment(undefined=StrictUndefined, autoescape=True, finalize=_plain, **layout)
+    return environment.from_string(files(__package__).joinpath(template).read_text(encoding="utf-8")).render(**facts)
+
+
+def _plain(value: Any) -> Any:
+    return ACTIVE.sub(" ", value) if type(value) is str else value

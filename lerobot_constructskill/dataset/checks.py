@@ -1,14 +1,15 @@
-"""What a data set of demonstrations owes: each check takes it as tables and yields a sentence for each thing wrong.
+"""Checks of a data set of demonstrations: each reads it as tables and yields a sentence for each thing that is wrong.
 
-`CHECKS` names them. Noise is not judged by its spread alone: it is a function of the seed, so it is drawn again.
+`CHECKS` names the checks. Noise is not judged by its spread alone: it is a function of the seed, so it is drawn again.
 """
 
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.bounds import check_values as check_fields
+from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     DEMO_SEED_START,
@@ -20,19 +21,17 @@ from lerobot_constructskill.contract import (
     SIM_STATE,
     get_task,
 )
-from lerobot_constructskill.dataset.card import Provenance
+from lerobot_constructskill.dataset.card import SidecarFields
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
-from lerobot_constructskill.dataset.reading import check_reading
-from lerobot_constructskill.dataset.rounds import check_rounds
-from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.columns import ACTORS, EXPERT, SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
-from lerobot_constructskill.demos.hashes import file_hashes
 from lerobot_constructskill.demos.merge import frame_statistics
-from lerobot_constructskill.demos.modality import MODALITY
+from lerobot_constructskill.demos.metadata import MODALITY, file_hashes
 from lerobot_constructskill.demos.noise import execute
 from lerobot_constructskill.demos.settings import FRAME_PACKAGES
 from lerobot_constructskill.errors import InputError, UserError, plural
+from lerobot_constructskill.progress import Progress
 
 type Check = Callable[[DataSet], Iterator[str]]
 
@@ -47,24 +46,26 @@ HARDLY_ASKED = 0.1
 """An axis that is asked for less than this share of the strongest one moves by the arm's sag: no response to judge."""
 
 
+def _found(complaints: Mapping[str, Any]) -> Iterator[str]:
+    """The sentences whose conditions hold, in their order."""
+    return (said for said, is_wrong in complaints.items() if is_wrong)
+
+
 def check_files(data: DataSet) -> Iterator[str]:
     recorded, found = data.facts["sha256"], file_hashes(data.root)
-    for name in sorted(recorded.keys() - found.keys()):
-        yield f"{name} is missing."
-    for name in sorted(found.keys() - recorded.keys()):
-        yield f"{name} was added after the generation."
-    for name in sorted(name for name in recorded.keys() & found.keys() if recorded[name] != found[name]):
-        yield f"{name} is not the file that was generated: its SHA-256 differs."
+    yield from (f"{name} is missing." for name in sorted(recorded.keys() - found.keys()))
+    yield from (f"{name} was added after the generation." for name in sorted(found.keys() - recorded.keys()))
+    changed = sorted(name for name in recorded.keys() & found.keys() if recorded[name] != found[name])
+    yield from (f"{name} is not the file that was generated: its SHA-256 differs." for name in changed)
 
 
 def check_schema(data: DataSet) -> Iterator[str]:
     try:
-        check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+        check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
     except InputError as error:
         yield str(error)
     task, features, wanted = get_task(data.config.task), data.info["features"], data.columns
-    for name in sorted(wanted.keys() - features.keys()):
-        yield f"info.json has no feature {name}."
+    yield from (f"info.json has no feature {name}." for name in sorted(wanted.keys() - features.keys()))
     for name in sorted(features.keys() - wanted.keys() - BOOKKEEPING):
         yield f"info.json has the feature {name}, which is not of the contract and which a policy may read."
     for name in wanted.keys() & features.keys():
@@ -74,35 +75,38 @@ def check_schema(data: DataSet) -> Iterator[str]:
     stored = {name for name, feature in wanted.items() if feature["dtype"] != "video"} | BOOKKEEPING
     for name in sorted(stored ^ set(data.rows.columns)):
         yield f"data/ {'has no' if name in stored else 'has an unknown'} column {name}."
-    if data.info["fps"] != FPS:
-        yield f"info.json says {data.info['fps']} frames a second, not {FPS}."
-    if data.tasks != [task.instruction]:
-        yield f"The instruction is {data.tasks}, not '{task.instruction}'."
+    yield from _found(
+        {
+            f"info.json says {data.info['fps']} frames a second, not {FPS}.": data.info["fps"] != FPS,
+            f"The instruction is {data.tasks}, not '{task.instruction}'.": data.tasks != [task.instruction],
+        }
+    )
 
 
 def check_values(data: DataSet) -> Iterator[str]:
     for name, feature in data.info["features"].items():
         if feature["dtype"] == "float32":
-            finite = np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
-            if not finite.all():
-                yield f"{name} is not finite in {plural((~finite).sum(), 'frame')}."
+            off = ~np.isfinite(data.column(name)).reshape(len(data.rows), -1).all(axis=1)
+            yield from _found({f"{name} is not finite in {plural(off.sum(), 'frame')}.": off.any()})
     experts = data.rounds == 0  # a learner's action is bounded by the environment alone
     limits = {"action": ACTION_SCALE, "dart.executed_action": np.where(experts, data.config.noise.clip, ACTION_SCALE)}
     for name, limit in limits.items():
-        largest = np.abs(data.column(name)[:, :-1]).max(axis=1)
-        if (largest > limit + 1e-6).any():
-            most = np.max(limit)
-            yield f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
+        largest, most = np.abs(data.column(name)[:, :-1]).max(axis=1), np.max(limit)
         odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED)) & (experts | (name == "action"))
-        if odd.any():
-            yield f"{name} has a gripper that is neither +1 nor -1 in {plural(odd.sum(), 'frame')}."
-    state = data.column("observation.state")
-    if np.linalg.norm(state[:, :3], axis=1).max() > REACH:
-        yield f"observation.state has positions beyond the robot's reach of {REACH} m."
-    if not ((state[:, 6:] > -0.001) & (state[:, 6:] < 0.041)).all():
-        yield "observation.state has finger positions outside 0 to 0.04 m."
-    if not np.isin(data.column("next.reward"), (0, REWARD_LIFTED, REWARD_PLACED)).all():
-        yield f"next.reward is not one of 0, {REWARD_LIFTED} and {REWARD_PLACED} everywhere."
+        units = f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
+        gripper = f"{name} has a gripper that is neither +1 nor -1 in {plural(odd.sum(), 'frame')}."
+        yield from _found({units: (largest > limit + 1e-6).any(), gripper: odd.any()})
+    state, rewards = data.column("observation.state"), (0, REWARD_LIFTED, REWARD_PLACED)
+    reach, fingers = np.linalg.norm(state[:, :3], axis=1).max(), state[:, 6:]
+    yield from _found(
+        {
+            f"observation.state has positions beyond the robot's reach of {REACH} m.": reach > REACH,
+            "observation.state has finger positions outside 0 to 0.04 m.": not (
+                (fingers > -0.001) & (fingers < 0.041)
+            ).all(),
+            f"next.reward is not one of {rewards} everywhere.": not np.isin(data.column("next.reward"), rewards).all(),
+        }
+    )
 
 
 def check_units(data: DataSet) -> Iterator[str]:
@@ -111,51 +115,47 @@ def check_units(data: DataSet) -> Iterator[str]:
     inner = (np.diff(data.column("episode_index")) == 0) & (np.abs(executed[:-1]).max(axis=1) > 0)
     inner &= data.rounds[:-1] == 0  # a learner pushes against things
     asked, moved = executed[:-1][inner], np.diff(position, axis=0)[inner]
-    strength = np.sqrt((asked**2).mean(axis=0))
-    for axis, name in enumerate("xyz"):
-        if strength[axis] < HARDLY_ASKED * strength.max():
-            continue
-        response = asked[:, axis] @ moved[:, axis] / (asked[:, axis] @ asked[:, axis] + 1e-12)
-        if not RESPONSE[0] <= response <= RESPONSE[1]:
-            low, high = RESPONSE
-            yield f"The end effector moves {response:.3g} m in {name} for a metre asked for, not {low} to {high} m."
+    strength, (low, high) = np.sqrt((asked**2).mean(axis=0)), RESPONSE
+    response = (asked * moved).sum(axis=0) / ((asked**2).sum(axis=0) + 1e-12)
+    for axis in np.flatnonzero(strength >= HARDLY_ASKED * strength.max()):
+        if not low <= response[axis] <= high:
+            yield (
+                f"The end effector moves {response[axis]:.3g} m in {'xyz'[axis]} for a metre asked for, not {low} to "
+                f"{high} m."
+            )
 
 
 def check_noise(data: DataSet) -> Iterator[str]:
-    config = data.config
+    config, experts = data.config, data.rounds == 0
     executed, added = data.column("dart.executed_action"), data.column("dart.noise")
     clean = executed.copy()
     clean[:, :3] -= added
-    experts = data.rounds == 0
     wanted = (executed if config.labels == "executed" else clean).copy()
     if config.labels == "advice":
-        for row, advised in _advice(data, np.flatnonzero(experts)):
-            wanted[row] = advised
+        wanted[experts] = _advice(data, np.flatnonzero(experts))
     off = np.abs(data.column("action") - wanted)
     if off[experts].max(initial=0) > 1e-6 or off[:, :3].max() > 1e-6:
         yield f"action is not the {config.labels} action that the provenance says its labels are."
-    phases, seeds = data.column("phase"), data.column("sim.seed")
-    drawn = executed.copy()
+    phases, drawn = data.column("phase"), executed.copy()
     for span in (span for span in data.spans() if experts[span.start]):
-        rng = np.random.default_rng(int(seeds[span.start]))
+        rng = np.random.default_rng(int(data.column("sim.seed")[span.start]))
         for row in range(span.start, span.stop):
             drawn[row] = execute(clean[row], phases[row], config.noise, rng)
+    off = np.abs(drawn - executed).max(axis=1) > 1e-6
     for phase in Phase:
         rows = (phases == phase) & experts
-        off = np.abs(drawn - executed)[rows].max(initial=0)
-        if off > 1e-6:
+        if off[rows].any():
             spread = ", ".join(f"{1000 * value:.1f}" for value in added[rows].std(axis=0))
             model = config.noise.model
             yield f"The noise in {phase} (std {spread} mm) is not what the {model} model draws from the seed."
 
 
-def _advice(data: DataSet, rows: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """What the expert advises in some frames."""
+def _advice(data: DataSet, rows: np.ndarray) -> np.ndarray:
+    """The actions that the expert advises in some frames, (n, channels)."""
     expert = make_expert(get_task(data.config.task), data.config.expert)
     known = {name: data.column(f"sim.{name}") for name in SIM_STATE if f"sim.{name}" in data.columns}
-    for row in rows:
-        state = PrivilegedState(**{name: np.atleast_1d(values[row]) for name, values in known.items()})
-        yield row, expert.advise(state).action
+    states = ({name: np.atleast_1d(values[row]) for name, values in known.items()} for row in rows)
+    return np.array([expert.advise(PrivilegedState(**state)).action for state in states])
 
 
 def check_episodes(data: DataSet) -> Iterator[str]:
@@ -165,32 +165,36 @@ def check_episodes(data: DataSet) -> Iterator[str]:
         yield f"The rows have the episodes {_few(indices)}, the metadata {len(data.episodes)}."
     for span, (_, episode) in zip(spans, data.episodes.iterrows(), strict=False):
         yield from _check_episode(data, span, f"Episode {episode['episode_index']}", episode)
-    if not np.array_equal(data.column("index"), np.arange(rows)):
-        yield "index does not count the frames of the data set one by one."
-    if (other := data.column("task_index") != 0).any():
-        yield f"task_index is of another instruction than the only one in {plural(other.sum(), 'frame')}."
-    for name, count in (("total_episodes", len(spans)), ("total_frames", rows), ("total_tasks", len(data.tasks))):
-        if data.info.get(name) != count:
-            yield f"info.json says {name} is {data.info.get(name)}, but there are {count}."
+    counts = {"total_episodes": len(spans), "total_frames": rows, "total_tasks": len(data.tasks)}
+    other = data.column("task_index") != 0
+    unknown = f"task_index is of another instruction than the only one in {plural(other.sum(), 'frame')}."
+    uncounted = "index does not count the frames of the data set one by one."
+    yield from _found(
+        {uncounted: not np.array_equal(data.column("index"), np.arange(rows)), unknown: other.any()}
+        | {
+            f"info.json says {name} is {data.info.get(name)}, but there are {count}.": data.info.get(name) != count
+            for name, count in counts.items()
+        }
+    )
 
 
 def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[str]:
-    length = span.stop - span.start
-    if not np.array_equal(data.column("frame_index")[span], np.arange(length)):
-        yield f"{who} has a gap: frame_index does not count its {length} frames."
-    if (episode["dataset_from_index"], episode["dataset_to_index"]) != (span.start, span.stop):
-        yield f"{who} has rows {span.start} to {span.stop}, its metadata have others."
-    if len(set(data.column("sim.seed")[span])) > 1:
-        yield f"{who} has frames of several seeds."
+    length, is_round = span.stop - span.start, data.rounds[span.start] > 0
     done, success = data.column("next.done")[span], data.column("next.success")[span]
-    if data.rounds[span.start] > 0:
-        if done[:-1].any() or success[:-1].any() or not done[-1]:
-            yield f"{who} of a round goes on after its end, or ends before its last frame."
-        return
-    if list(dict.fromkeys(data.column("phase")[span])) != list(Phase):
-        yield f"{who} does not go through the six phases in order."
-    if done[:-1].any() or not (done[-1] and success[-1]):
-        yield f"{who} does not end in success, or ends before its last frame."
+    place, phases = (episode["dataset_from_index"], episode["dataset_to_index"]), data.column("phase")[span]
+    counted = np.array_equal(data.column("frame_index")[span], np.arange(length))
+    yield from _found(
+        {
+            f"{who} has a gap: frame_index does not count its {length} frames.": not counted,
+            f"{who} has rows {span.start} to {span.stop}, its metadata have others.": place != (span.start, span.stop),
+            f"{who} has frames of several seeds.": len(set(data.column("sim.seed")[span])) > 1,
+            f"{who} goes on after its end, or ends before its last frame.": done[:-1].any() or not done[-1],
+            f"{who} of a round goes on after its success.": is_round and success[:-1].any(),
+            f"{who} does not go through the six phases in order.": not is_round
+            and list(dict.fromkeys(phases)) != list(Phase),
+            f"{who} does not end in success.": not is_round and not success[-1],
+        }
+    )
 
 
 def check_timestamps(data: DataSet) -> Iterator[str]:
@@ -204,69 +208,103 @@ def check_duplicates(data: DataSet) -> Iterator[str]:
 
     A learner does repeat itself in a task whose initial state is always the same.
     """
-    if data.config.noise.root.any():
-        seen: dict[bytes, int] = {}
-        for episode, span in enumerate(data.spans()):
-            first = seen.setdefault(data.column("dart.executed_action")[span].tobytes(), episode)
-            if first != episode and data.rounds[span.start] == 0:
-                yield f"Episode {episode} repeats episode {first}."
-    state, asked = data.column("observation.state"), np.abs(data.column("dart.executed_action")[:, :3]).max(axis=1)
-    still = (np.diff(state, axis=0) == 0).all(axis=1) & (np.diff(data.column("episode_index")) == 0)
-    frozen = still & (asked[:-1] > 0.005)
-    if frozen.any():
-        first = frozen.argmax() + 1
-        yield f"The state stays the same in {plural(frozen.sum(), 'frame')} though the arm should move, first {first}."
+    executed, seen = data.column("dart.executed_action"), {}
+    for episode, span in enumerate(data.spans() if data.config.noise.root.any() else ()):
+        first = seen.setdefault(executed[span].tobytes(), episode)
+        if first != episode and data.rounds[span.start] == 0:
+            yield f"Episode {episode} repeats episode {first}."
+    still = (np.diff(data.column("observation.state"), axis=0) == 0).all(axis=1)
+    still &= (np.diff(data.column("episode_index")) == 0) & (np.abs(executed[:-1, :3]).max(axis=1) > 0.005)
+    if still.any():
+        first = still.argmax() + 1
+        yield f"The state stays the same in {plural(still.sum(), 'frame')} though the arm should move, first {first}."
 
 
 def check_hold_out(data: DataSet) -> Iterator[str]:
     """Holding out whole episodes separates seeds: no seed makes two episodes, and none is an evaluation's."""
-    seeds = data.column("sim.seed")[[span.start for span in data.spans()]]
-    values, counts = np.unique(seeds, return_counts=True)
-    if (counts > 1).any():
-        yield f"Seeds {_few(values[counts > 1])} made several episodes, so holding one out does not hold it out."
-    if values.min() < DEMO_SEED_START:
-        yield f"Seeds {_few(values[values < DEMO_SEED_START])} are below {DEMO_SEED_START}: evaluations use those."
+    seeds, counts = np.unique(data.column("sim.seed")[[span.start for span in data.spans()]], return_counts=True)
+    twice, low = seeds[counts > 1], seeds[seeds < DEMO_SEED_START]
+    yield from _found(
+        {
+            f"Seeds {_few(twice)} made several episodes, so holding one out does not hold it out.": len(twice),
+            f"Seeds {_few(low)} are below {DEMO_SEED_START}: evaluations use those.": len(low),
+        }
+    )
 
 
 def check_statistics(data: DataSet) -> Iterator[str]:
     for name, wanted in frame_statistics(data.root).items():
+        told = of_name if isinstance(of_name := data.stats.get(name), dict) else {}
+        yield from (f"stats.json has no {statistic} of {name}." for statistic in wanted if told.get(statistic) is None)
         for statistic, value in wanted.items():
-            found = of_name.get(statistic) if isinstance(of_name := data.stats.get(name), dict) else None
-            if found is None:
-                yield f"stats.json has no {statistic} of {name}."
-            elif not _is_close(found, value):
-                yield f"stats.json has {statistic} {found} of {name}; of the frames it is {value.tolist()}."
+            if told.get(statistic) is not None and not _is_close(told[statistic], value):
+                yield f"stats.json has {statistic} {told[statistic]} of {name}; of the frames it is {value.tolist()}."
     for camera in data.cameras:
         if not {"mean", "std", "q01", "q99"} <= data.stats.get(camera, {}).keys():
             yield f"stats.json lacks the mean, std or quantiles of {camera}."
-        if (of_episodes := f"stats/{camera}/mean") in data.episodes:
-            several = data.episodes[data.episodes["length"] > 1]  # LeRobot has none of a single frame
-            without = several["episode_index"][several[of_episodes].isna()]
-            if len(without):
-                yield f"Episodes {_few(without)} have no statistics of {camera}: LeRobot gave up their video."
+        several = data.episodes[data.episodes["length"] > 1]  # LeRobot has none of a single frame
+        without = several["episode_index"][several.get(f"stats/{camera}/mean", several["length"]).isna()]
+        if len(without):
+            yield f"Episodes {_few(without)} have no statistics of {camera}: LeRobot gave up their video."
 
 
 def check_provenance(data: DataSet) -> Iterator[str]:
-    discarded = data.facts["discarded_seeds"]
-    starts = [span.start for span in data.spans()]
-    seeds = data.column("sim.seed")[[start for start in starts if data.rounds[start] == 0]].tolist()
-    wanted = range(data.config.seed_start, data.config.seed_start + data.facts["attempts"])
+    starts = [span.start for span in data.spans() if data.rounds[span.start] == 0]
+    seeds, discarded = data.column("sim.seed")[starts].tolist(), data.facts["discarded_seeds"]
+    attempts = range(data.config.seed_start, data.config.seed_start + data.facts["attempts"])
+    drawn, told = data.config.noise.root @ data.config.noise.root, data.facts["noise_covariance"]
+    missing = ", ".join(sorted(set(FRAME_PACKAGES) - data.facts["versions"].keys()))
     yield from check_rounds(data)
-    found = sorted([*seeds, *discarded])
-    if len(found) != len(wanted) or any(map(operator.ne, found, wanted)):
-        yield "The seeds of the episodes and the discarded ones are not those of the attempts, one by one."
-    if seeds != sorted(seeds):
-        yield "The episodes are not in the order of their seeds."
-    covariance = data.config.noise.root @ data.config.noise.root
-    if not _is_close(data.facts["noise_covariance"], covariance):
-        yield f"noise_covariance is {data.facts['noise_covariance']}; of the settings it is {covariance.tolist()}."
-    missing = set(FRAME_PACKAGES) - data.facts["versions"].keys()
-    if missing:
-        yield f"The versions of {', '.join(sorted(missing))} are not recorded."
-    if data.facts["generator"]["light_robot"] is None:
-        yield "Whether the light robot was drawn is not recorded."
-    if not (data.root / MODALITY).is_file():
-        yield f"{MODALITY} is missing."
+    yield from _found(
+        {
+            "The seeds of the episodes and the discarded ones are not those of the attempts, one by one.": (
+                not _counts(sorted([*seeds, *discarded]), attempts)
+            ),
+            "The episodes are not in the order of their seeds.": seeds != sorted(seeds),
+            f"noise_covariance is {told}; of the settings it is {drawn.tolist()}.": not _is_close(told, drawn),
+            f"The versions of {missing} are not recorded.": missing,
+            "Whether the light robot was drawn is not recorded.": data.facts["generator"]["light_robot"] is None,
+            f"{MODALITY} is missing.": not (data.root / MODALITY).is_file(),
+        }
+    )
+
+
+def check_rounds(data: DataSet) -> Iterator[str]:
+    """Compare rounds, actors and seeds of DAgger's frames with the provenance; demonstrations alone have none."""
+    if "dagger" not in data.facts:
+        return
+    actors, listed = data.column("dagger.actor"), data.facts["dagger"]["rounds"]
+    by_expert = actors == EXPERT
+    unknown = set(data.rounds) - {0} - {entry["round"] for entry in listed}
+    off = np.abs(data.column("dart.executed_action") - data.column("action"))[by_expert & (data.rounds > 0)]
+    yield from _found(
+        {
+            f"dagger.actor is not one of {', '.join(ACTORS)} everywhere.": not np.isin(actors, ACTORS).all(),
+            "Somebody other than the expert acts in a demonstration.": not by_expert[data.rounds == 0].all(),
+            "The rounds of the frames are not those of the provenance, one after another.": (
+                unknown or (np.diff(data.rounds) < 0).any()
+            ),
+            "Frames of a round in which the expert acted do not execute its action.": off.max(initial=0) > 1e-6,
+        }
+    )
+    for entry in listed:
+        number, first, rows = entry["round"], entry["seed_start"], data.rounds == entry["round"]
+        counts, told = (int(rows.sum()), int(by_expert[rows].sum())), (entry["frames"], entry["by_expert"])
+        seeds = sorted([*np.unique(data.column("sim.seed")[rows]).tolist(), *entry["discarded_seeds"]])
+        yield from _found(
+            {
+                f"Round {number} has {counts[0]} frames, {counts[1]} by the expert; its provenance says {told[0]} and "
+                f"{told[1]}.": counts != told,
+                f"The seeds of round {number} and its discarded ones do not count up from {first}.": (
+                    not _counts(seeds, range(first, first + entry["episodes"]))
+                ),
+            }
+        )
+
+
+def _counts(seeds: list[int], wanted: range) -> bool:
+    """Whether seeds are those of a range, which a file may say is longer than any memory."""
+    return len(seeds) == len(wanted) and all(map(operator.eq, seeds, wanted))
 
 
 def _is_close(found, value: np.ndarray) -> bool:
@@ -295,12 +333,17 @@ CHECKS: dict[str, Check] = {
     "Episodes": check_episodes,
     "Time stamps": check_timestamps,
     **FRAME_CHECKS,
-    "Reading": check_reading,
     "Duplicates": check_duplicates,
     "Hold-out": check_hold_out,
     "Statistics": check_statistics,
     "Provenance": check_provenance,
 }
+
+
+def examine(data: DataSet) -> Iterator[tuple[str, list[str]]]:
+    """Yield the name of each check and what it finds wrong, with a bar."""
+    for name, check in Progress(CHECKS.items(), "check", unit="check", leave=False):
+        yield name, complaints(data, check)
 
 
 def complaints(data: DataSet, check: Check) -> list[str]:

@@ -1,6 +1,7 @@
-"""A finished data set as plain tables, read from its files alone: whoever checks LeRobot's work cannot ask LeRobot."""
+"""Reads a finished data set as plain tables from its files, without LeRobot, whose work the tables serve to check."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
     MADE,
@@ -19,7 +20,7 @@ from lerobot_constructskill.demos.columns import (
     demonstration_features,
 )
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.files import Json, read_parquet
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 from lerobot_constructskill.parsing import decode
@@ -29,18 +30,21 @@ STATISTICS = Json("statistics of columns", dict[str, dict[str, Any]])
 
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
 VIDEO_COLUMNS = "chunk_index", "file_index", "from_timestamp", "to_timestamp"
-"""What LeRobot's episode tables say of every episode, and of its part of every video."""
+"""Columns of LeRobot's episode tables about every episode, and about its part of every video."""
 
+
+LATE_S = 1e-4
+"""Seconds by which a frame may be late: LeRobot reads none that is off by more."""
 
 PLACE = re.compile(r"(?!/)([\w./-]|\{(video_key|chunk_index(:0?\dd)?|file_index(:0?\dd)?)\})+")
-"""Where a data set's videos may lie, as LeRobot's `video_path` says it."""
+"""The places of videos that LeRobot's `video_path` may name: all are inside the data set."""
 
 NUMBERS = {"float32": "f", "float64": "f", "int64": "i", "int32": "i", "bool": "b"}
-"""A column's `dtype` to the kind that NumPy has for it; a whole number that is missing makes all of them floats."""
+"""A column's `dtype` to NumPy's kind; a missing value turns a column of whole numbers into floats."""
 
 
 class Facts(dict):
-    """A JSON object of a data set; what it lacks is no error of those who ask for it.
+    """A JSON object of a data set. A missing field is an `InputError`, because the file is wrong and not our code.
 
     Args:
         file: the file that it is from.
@@ -105,9 +109,9 @@ class DataSet:
 
     @cached_property
     def columns(self) -> dict[str, dict[str, Any]]:
-        """The columns that it should have, those of DAgger among them where it says that a learner drove.
+        """The columns that the data set should have, with DAgger's if a learner drove.
 
-        A set that has no joints at all is of before they were recorded.
+        A set without any column of joints was made before joints were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
         features = made(get_task(self.config.task), self.config.obs_type)
@@ -162,12 +166,10 @@ def open_dataset(root: Path) -> DataSet:
     if data.rows.empty:
         raise InputError("data/ holds no frames.")
     of_videos = [f"videos/{camera}/{name}" for camera in data.cameras for name in VIDEO_COLUMNS]
-    missing = [name for name in (*EPISODE_COLUMNS, *of_videos) if name not in data.episodes]
-    if missing:
-        raise InputError(f"meta/episodes/ has no column {missing[0]}.")
     for name in (*EPISODE_COLUMNS, *of_videos):
-        if data.episodes[name].dtype.kind not in "if" or not np.isfinite(data.episodes[name]).all():
-            raise InputError(f"{name} in meta/episodes/ must be a number in every row.")
+        values = data.episodes.get(name)
+        if values is None or values.dtype.kind not in "if" or not np.isfinite(values).all():
+            raise InputError(f"meta/episodes/ must have {name}, a number in every row.")
     return data
 
 
@@ -217,3 +219,30 @@ def _tables(root: Path, pattern: str) -> pd.DataFrame:
     if not paths:
         raise InputError(f"{pattern} cannot be read (there is no such file).")
     return pd.concat([read_parquet(path).to_pandas() for path in paths], ignore_index=len(paths) > 1)
+
+
+def video_complaints(path: Path, name: Path, expected: int, fps: float) -> Iterator[str]:
+    """Yield what is wrong with the time stamps of a video: it cannot be read, lacks frames or has another rate.
+
+    Args:
+        name: what to call it.
+        expected: how many frames it has, at least.
+        fps: how many frames a second.
+    """
+    import av
+
+    if not path.is_file():
+        yield f"{name} is missing."
+        return
+    try:
+        with av.open(str(path)) as video:
+            stream = video.streams.video[0]
+            stamps = sorted(packet.pts * stream.time_base for packet in video.demux(stream) if packet.pts is not None)
+    except (av.FFmpegError, IndexError) as error:
+        yield f"{name} cannot be read ({error})."
+        return
+    times = np.array(stamps, dtype=float)
+    if len(times) < expected:
+        yield f"{name} has {plural(len(times), 'frame')}, but its episodes have {expected} rows."
+    elif np.abs(times * fps - np.arange(len(times))).max(initial=0) > LATE_S * FPS:
+        yield f"{name} has not the {fps} frames a second (fps) that meta/info.json says."

@@ -1,17 +1,19 @@
-"""Data sets to and from the Hub by huggingface_hub's own functions, its errors as one sentence without any token."""
+"""Moves data sets to and from the Hub by huggingface_hub; each of its errors becomes one sentence without a token."""
 
 import logging
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, snapshot_download
+from huggingface_hub.utils import filter_repo_objects
+
 from lerobot_constructskill.artifacts.digests import data_sha256, files_below
-from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
 from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
-from lerobot_constructskill.dataset.frames import packet_times
+from lerobot_constructskill.dataset.dataset import read_info, video_complaints
 from lerobot_constructskill.errors import (
     InputError,
     MachineError,
@@ -22,6 +24,7 @@ from lerobot_constructskill.errors import (
     plural,
 )
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO, TRAIN_CONFIG, TRAINED
+from lerobot_constructskill.training.recipe import FACTS, SAID
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -37,25 +40,30 @@ PUSHED = [
     "data/*.parquet",
     "videos/*.mp4",
 ]
-"""What leaves the machine; `*` stands for folders as well."""
+"""Files that are uploaded; `*` stands for folders as well."""
 
-SAME_RATE = 0.01
-"""Share by which a video's rate may differ from the data set's."""
+SET_FOLDERS = ("data/", "videos/", "meta/")
+"""Folders whose files are deleted on the Hub where the pushed set lacks them."""
 
 UNTOUCHED = {".gitattributes"}
-"""What the Hub itself puts into a new repository."""
+"""Files that the Hub itself puts into a new repository."""
 
 LOGIN = "`hf auth login` stores a token, HF_TOKEN gives one for a single command."
 
 
-def locate(repo_id: str | None, root: Path | None, revision: str | None = None) -> Path:
-    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else what the Hub has.
+def locate(repo_id: str | None, root: Path | None = None, revision: str | None = None) -> Path:
+    """The folder of a data set: `root`, else LeRobot's own copy of `repo_id`, else a revision that the Hub has.
+
+    The revision, by default LeRobot's version tag, is downloaded into LeRobot's cache, or found there offline.
 
     Raises:
         ValueError: neither a name nor a folder was given, or a folder and a revision.
-        FileNotFoundError: the folder, or the data set on the Hub, is not there.
+        FileNotFoundError: the folder is not there.
+        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
     """
-    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
+    from lerobot.datasets import CODEBASE_VERSION
+
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
 
     if root is not None:
         if not root.is_dir():
@@ -67,20 +75,6 @@ def locate(repo_id: str | None, root: Path | None, revision: str | None = None) 
         raise InputError("Give a data set's name with --repo_id, or its folder with --root.")
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
-    return pull(repo_id, revision)
-
-
-def pull(repo_id: str, revision: str | None = None) -> Path:
-    """Bring a revision (LeRobot's version tag by default) into LeRobot's cache, or find it there without a network.
-
-    Raises:
-        OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
-    """
-    from huggingface_hub import snapshot_download
-    from lerobot.datasets import CODEBASE_VERSION
-
-    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HUB_CACHE
-
     revision = revision or CODEBASE_VERSION
     with one_sentence(repo_id, revision):
         folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
@@ -102,21 +96,17 @@ def open_lerobot(
     """
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_constructskill.dataset.dataset import read_info
-
     if root is not None:
         read_info(root)
     try:
         with one_sentence(repo_id, revision):
             dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
-    except (UserError, OSError) as error:
-        if root is None:
-            raise
-        # It looks on the Hub for what it cannot read, and its last word is about that.
-        raise MachineError(f"LeRobot cannot open the data set in {root} ({first_line(_first(error))}).") from error
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
-        said = f"{type(error).__name__}: {error}"
-        raise InputError(f"LeRobot cannot open the data set '{repo_id}' ({said}).") from error
+        if root is None and isinstance(error, UserError | OSError):
+            raise
+        # LeRobot looks on the Hub for what it cannot read, and its last word is about that.
+        said = first_line(_first(error))
+        raise InputError(f"LeRobot cannot open the data set {root or repo_id} ({said}).") from error
     _check_videos(dataset)
     return dataset
 
@@ -127,33 +117,26 @@ def _first(error: BaseException) -> BaseException:
 
 
 def _check_videos(dataset: "LeRobotDataset") -> None:
-    """Refuse videos that are not whole, or of another rate than the data set says, before an hour of work."""
+    """Refuse incomplete videos, and videos of another rate than the data set's, before an hour of work."""
     rows: dict[Path, int] = {}
     for episode in dataset.meta.episodes:
         for camera in dataset.meta.video_keys:
             path = dataset.root / dataset.meta.get_video_file_path(episode["episode_index"], camera)
             rows[path] = rows.get(path, 0) + episode["length"]
     for path, wanted in rows.items():
-        name = path.relative_to(dataset.root)
-        times = packet_times(path, name)
-        if len(times) < wanted:
-            raise InputError(f"{name} has {len(times)} frames, but its episodes have {wanted}.")
-        rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else dataset.fps
-        if abs(rate - dataset.fps) > SAME_RATE * rate:
-            raise InputError(
-                f"{INFO} says {dataset.fps} frames a second, but {name} has {rate:.4g}: put back the fps that it had."
-            )
+        for complaint in video_complaints(path, path.relative_to(dataset.root), wanted, dataset.fps):
+            raise InputError(complaint)
 
 
 def choose_held_out(
     dataset: "LeRobotDataset", episodes: list[int] | None, checkpoints: Iterable[Path | str]
 ) -> list[int]:
-    """The episodes that were named, or those that the contract holds out, if no checkpoint was trained on them.
+    """The named episodes, or by default those that the contract holds out, if no checkpoint was trained on them.
 
-    Where it cannot be told what a checkpoint was trained on, a line says so.
+    A warning names each checkpoint whose training episodes are unknown.
 
     Raises:
-        InputError: there are none, the data set has not all of them, or a checkpoint has seen one that nobody named.
+        InputError: there are no such episodes, or a checkpoint was trained on one that is held out by default.
     """
     chosen = held_out(dataset.num_episodes) if episodes is None else episodes
     if not chosen:
@@ -172,20 +155,25 @@ def choose_held_out(
 
 
 def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
-    """The episodes of a data set that a checkpoint in a folder says it was trained on, or on their features.
+    """The episodes of a data set on which, or on whose features, a checkpoint in a folder was trained.
 
-    None if it cannot be told: it lies on the Hub, or its training set is not where it was. Of the episodes of each
-    task that it is given LeRobot keeps the last for its own evaluation, a share `eval_split` rounded up. A study and
-    DAgger say how much they hold out, and not of which folder.
+    LeRobot holds out the last episodes of each task, a share `eval_split` that is rounded up. A study and DAgger
+    record how much they hold out, but not of which folder.
+
+    Returns:
+        None if it is unknown: the checkpoint is on the Hub, or its training set was moved.
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
-    path = checkpoint / TRAIN_CONFIG
-    if not path.is_file():
-        return set() if _holds_out_as_the_contract(checkpoint) else None
-    told = TRAINED.read(path).get("dataset", {})
+    if not (checkpoint / TRAIN_CONFIG).is_file():
+        facts = checkpoint / FACTS
+        is_known = facts.is_file() and SAID.read(facts)["training"]["holdout"] == HELD_OUT_EVERY
+        return set() if is_known else None
+    told = TRAINED.read(checkpoint / TRAIN_CONFIG).get("dataset", {})
     folder = Path(told["root"]) if told.get("root") else HF_LEROBOT_HOME / told.get("repo_id", "")
-    sources = _sources(folder)
+    features = DATA_SET.read(folder / INFO)["features"] if (folder / INFO).is_file() else {}
+    # A feature set says of its columns which data set they were encoded from.
+    sources = [info for one in features.values() if "source_repo_id" in (info := one.get("info") or {})]
     is_it = (
         dataset.repo_id in (told.get("repo_id"), *(source["source_repo_id"] for source in sources))
         or folder.resolve() == dataset.root.resolve()
@@ -202,29 +190,12 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     return {episode for own in tasks.values() for episode in own[: len(own) - ceil(len(own) * share)]}
 
 
-def _holds_out_as_the_contract(checkpoint: Path) -> bool:
-    path = checkpoint / SPEC
-    told = SPECIFICATION.read(path) if path.is_file() else {}
-    return told.get("training", {}).get("holdout") == HELD_OUT_EVERY
-
-
-def _sources(root: Path) -> list[dict[str, str]]:
-    """What a feature set that lies in a folder says of the data set whose features it holds."""
-    path = root / INFO
-    features = DATA_SET.read(path)["features"] if path.is_file() else {}
-    infos = [feature.get("info") or {} for feature in features.values()]
-    return [info for info in infos if "source_repo_id" in info]
-
-
 @contextmanager
 def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
-    import httpx
-    from huggingface_hub.errors import HFValidationError
-
     try:
         yield
-    except (OSError, RuntimeError, HFValidationError, httpx.HTTPError) as error:
+    except (OSError, RuntimeError, errors.HFValidationError, httpx.HTTPError) as error:
         # An upload's own error is the cause of a bare RuntimeError.
         reason = _reason(error.__cause__ if type(error) is RuntimeError else error, repo_id, revision)
         if reason is None:
@@ -233,72 +204,53 @@ def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
 
 
 def _reason(error: BaseException | None, repo_id: str, revision: str | None) -> str | None:
-    import httpx
-    from huggingface_hub import errors
-
-    if isinstance(error, errors.RevisionNotFoundError):
-        return f"'{repo_id}' has no revision '{revision}' on the Hub."
-    if isinstance(error, errors.RepositoryNotFoundError):
-        return f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}"
-    if isinstance(error, errors.LocalEntryNotFoundError):
-        of = f"revision '{revision}' of " if revision else ""
-        return f"The Hub cannot be reached and {of}'{repo_id}' is not in the cache."
-    if isinstance(error, errors.OfflineModeIsEnabled):
-        return f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."
-    if isinstance(error, errors.HfHubHTTPError):
-        return _refusal(repo_id, error.response.status_code)
-    if isinstance(error, errors.HFValidationError):
-        return f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."
-    if isinstance(error, httpx.ConnectError):
-        return f"The Hub cannot be reached for '{repo_id}'."
-    if isinstance(error, httpx.HTTPError):
-        return f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues."
-    return None
-
-
-def _refusal(repo_id: str, status: int | None) -> str:
-    if status == 401:
-        return f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"
-    if status == 403:
-        return (
-            f"The token of this machine may not write to '{repo_id}', or not read it: ask for access, or name another."
-        )
-    return f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."
+    """What an error of the Hub's client means; None for other errors."""
+    of = f"revision '{revision}' of " if revision else ""
+    status = error.response.status_code if isinstance(error, errors.HfHubHTTPError) else None
+    reasons = (  # the first whose class and status fit
+        (errors.RevisionNotFoundError, status, f"'{repo_id}' has no revision '{revision}' on the Hub."),
+        (
+            errors.RepositoryNotFoundError,
+            status,
+            f"The Hub has no '{repo_id}' that this machine may see; if it is private, {LOGIN}",
+        ),
+        (errors.LocalEntryNotFoundError, None, f"The Hub cannot be reached and {of}'{repo_id}' is not in the cache."),
+        (errors.OfflineModeIsEnabled, None, f"The Hub cannot be reached for '{repo_id}' while HF_HUB_OFFLINE is set."),
+        (errors.HfHubHTTPError, 401, f"The Hub knows no valid token of this machine for '{repo_id}'; {LOGIN}"),
+        (
+            errors.HfHubHTTPError,
+            403,
+            f"The token of this machine may not write to '{repo_id}', or not read it: ask for access or name another.",
+        ),
+        (errors.HfHubHTTPError, status, f"The Hub refused '{repo_id}' (HTTP status {status}); try again later."),
+        (errors.HFValidationError, None, f"'{repo_id}' is neither a folder nor a name on the Hub, user/name."),
+        (httpx.ConnectError, None, f"The Hub cannot be reached for '{repo_id}'."),
+        (
+            httpx.HTTPError,
+            None,
+            f"The connection to the Hub broke while '{repo_id}' was on its way; the same command continues.",
+        ),
+    )
+    return next((said for kind, code, said in reasons if isinstance(error, kind) and status == code), None)
 
 
 def check_private(repo_id: str, repo_type: str = "model") -> None:
-    """Refuse a repository that is there and public: the Hub makes new ones private alone.
+    """Refuse a repository that is public: the Hub makes only new ones private.
 
     Raises:
         InputError: it is public.
     """
-    from huggingface_hub import HfApi
-
-    api, repo = HfApi(), {"repo_id": repo_id, "repo_type": repo_type}
-    if api.repo_exists(**repo) and not api.repo_info(**repo).private:
+    if not HfApi().repo_info(repo_id, repo_type=repo_type).private:
         raise InputError(f"'{repo_id}' is on the Hub already and public: make it private there, or name another.")
 
 
 def _is_cut(root: Path, **repo: str) -> bool:
-    """Whether a repository without LeRobot's tag holds nothing but the set in `root`, whose push was interrupted."""
-    from huggingface_hub import HfApi
-
+    """Whether a repository without LeRobot's tag is empty or holds an interrupted push of the set in `root`."""
     api = HfApi()
     held = set(api.list_repo_files(**repo)) - UNTOUCHED
     if INFO not in held:
         return not held
     return Path(api.hf_hub_download(**repo, filename=INFO)).read_bytes() == (root / INFO).read_bytes()
-
-
-@contextmanager
-def _without_linked_folders(root: Path) -> Iterator[Path]:
-    """Yield a folder of links to all files of `root`: the Hub's client does not look into a folder that is a link."""
-    with tempfile.TemporaryDirectory() as folder:
-        for path in files_below(root, ""):
-            link = Path(folder) / path.relative_to(root)
-            link.parent.mkdir(parents=True, exist_ok=True)
-            link.symlink_to(path.resolve())
-        yield Path(folder)
 
 
 def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None, update: bool = False) -> str:
@@ -316,7 +268,6 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         InputError: it is public, and `private` is set.
         OSError: the Hub cannot be reached, or refuses the token or the name.
     """
-    from huggingface_hub import HfApi
     from lerobot.datasets import CODEBASE_VERSION
 
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
@@ -327,9 +278,15 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
         if not update and (CODEBASE_VERSION in tagged or not _is_cut(root, **repo)):
             raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
-        stale = ["data/*", "videos/*", "meta/*"]
-        with _without_linked_folders(root) as folder:
-            commit = api.upload_folder(**repo, folder_path=folder, allow_patterns=PUSHED, delete_patterns=stale)
+        # `upload_folder` does not look into a folder that is a link.
+        names = sorted(path.relative_to(root).as_posix() for path in files_below(root, ""))
+        pushed = list(filter_repo_objects(names, allow_patterns=PUSHED))
+        held = {name for name in api.list_repo_files(**repo) if name.startswith(SET_FOLDERS)}
+        operations = [
+            *(CommitOperationAdd(name, root / name) for name in pushed),
+            *map(CommitOperationDelete, held - set(pushed)),
+        ]
+        commit = api.create_commit(**repo, operations=operations, commit_message="Upload a data set")
         for name in dict.fromkeys(filter(None, (tag, CODEBASE_VERSION))):
             if name in tagged:
                 api.delete_tag(**repo, tag=name)

@@ -1,5 +1,6 @@
-"""Two pictures of a data set: what its phases look like, and where its end effector went."""
+"""Draws two pictures of a data set: the phases, and the paths of the end effector."""
 
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,8 @@ def contact_sheet(data: DataSet, path: Path) -> None:
         [*(span.start + int(np.argmax(phases[span] == phase)) for phase in Phase), span.stop - 1] for span in spans
     ]
     lines = [(camera, rows) for rows in wanted for camera in data.cameras]
-    shown = {camera: _frames(data, camera, {row for rows in wanted for row in rows}) for camera in data.cameras}
+    until = max(row for rows in wanted for row in rows) + 1
+    shown = {camera: dict(islice(pictures(data, camera), until)) for camera in data.cameras}
     figure = Figure(figsize=(1.6 * len(wanted[0]), 1.75 * len(lines)), layout="constrained")
     axes = figure.subplots(len(lines), len(wanted[0]), squeeze=False)
     for index, (camera, rows) in enumerate(lines):
@@ -59,16 +61,6 @@ def trajectories(data: DataSet, path: Path) -> None:
         axis.plot([], [], color=colour, label=phase)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
     _save(figure, path)
-
-
-def _frames(data: DataSet, camera: str, rows: set[int]) -> dict[int, np.ndarray]:
-    found = {}
-    for row, picture in pictures(data, camera):
-        if row in rows:
-            found[row] = picture
-        if len(found) == len(rows):
-            break
-    return found
 
 
 def _save(figure: Figure, path: Path) -> None:

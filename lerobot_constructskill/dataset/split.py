@@ -1,4 +1,4 @@
-"""How LeRobot is told which demonstrations to hold out: by their order, and a share that it takes from the end."""
+"""Makes LeRobot hold out every eighth demonstration, by the order of episodes and a share at their end."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
 
 SCHEMA = pa.schema([("episode_index", pa.int64()), ("length", pa.int64()), ("tasks", pa.list_(pa.string()))])
-"""What is read of LeRobot's table of episodes."""
+"""The columns that are read of LeRobot's table of episodes."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
     """
     out = set(held_out(len(lengths)))
     frames = sum(length for episode, length in enumerate(lengths) if episode not in out)
-    counts = [_counts(task, tasks, out) for task in dict.fromkeys(tasks)]
+    places = {task: [episode for episode, one in enumerate(tasks) if one == task] for task in dict.fromkeys(tasks)}
+    counts = [(len(out.intersection(own)), len(own)) for own in places.values()]  # held out, and all
     low, high = max((k - 1) / n for k, n in counts), min(k / n for k, n in counts)
     if out and low >= high:
         told = ", ".join(f"{k} of {n}" for k, n in counts)
@@ -72,9 +73,3 @@ def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
         )
     last = sorted(range(len(lengths)), key=out.__contains__)  # stable: both parts stay in order
     return Split(last, len(out), (low + high) / 2 if out else 0.0, frames)
-
-
-def _counts(task: str, tasks: Sequence[str], out: set[int]) -> tuple[int, int]:
-    """How many episodes of a task are held out, and how many it has."""
-    own = [episode for episode, one in enumerate(tasks) if one == task]
-    return len(out.intersection(own)), len(own)

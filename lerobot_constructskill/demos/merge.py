@@ -12,8 +12,7 @@ from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.demos.modality import write_meanings
+from lerobot_constructskill.demos.metadata import file_hashes, write_meanings
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
 from lerobot_constructskill.demos.shards import EPISODE, Attempt
 from lerobot_constructskill.errors import InputError

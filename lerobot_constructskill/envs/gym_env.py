@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from lerobot_constructskill.bounds import Among, Seed, Steps, check_values
+from lerobot_constructskill.bounds import Among, Seed, Steps, check_fields
 from lerobot_constructskill.contract import (
     BRICK,
     FPS,
@@ -76,7 +76,7 @@ class ConstructSkillEnv(gym.Env):
         perturb_seed: Seed = 0,
         cameras: tuple[str, ...] | None = None,
     ):
-        check_values(ConstructSkillEnv.__init__, locals())
+        check_fields(ConstructSkillEnv.__init__, locals())
         self._perturbation = Perturbation(perturb, perturb_seed)
         self._row = get_task(task)
         self._perturbation.check(self._row)

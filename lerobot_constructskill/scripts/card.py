@@ -4,21 +4,18 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import RepoId, check
+from lerobot_constructskill.bounds import Checked, RepoId
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
-class CardConfig:
+class CardConfig(Checked):
     """Write README.md, pictures/contact_sheet.jpg and pictures/trajectories.png for a data set."""
 
     root: Path  # the data set's folder
     repo_id: RepoId | None = None  # its name on the Hub; default: the one it was generated under
     out: Path | None = None  # folder to write; default: root
     facts: Path | None = None  # also write the card's facts as JSON here
-
-    def __post_init__(self):
-        check(self)
 
 
 def write_card(config: CardConfig) -> str:
@@ -45,7 +42,3 @@ def write_card(config: CardConfig) -> str:
 
 def main() -> None:
     run(CardConfig, write_card)
-
-
-if __name__ == "__main__":
-    main()

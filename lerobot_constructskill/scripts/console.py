@@ -1,4 +1,4 @@
-"""The edge of the console commands: a configuration from flags and YAML, and whatever goes wrong as one sentence."""
+"""Runs a console command: a configuration from flags and YAML, and one sentence for whatever goes wrong."""
 
 import argparse
 import logging
@@ -25,14 +25,14 @@ REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 """Exit statuses: something the user can fix; a fault of this package; Ctrl-C."""
 
 LONGEST = 2000
-"""Characters of a sentence; the log has the whole."""
+"""Largest number of characters of a sentence; the log has all of it."""
 
 DEBUG = "--debug"
 EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
 
 
 class Parser(argparse.ArgumentParser):
-    """Of a command without a configuration: what it cannot parse is one sentence too."""
+    """Parser of a command without a configuration, whose refusals are one sentence too."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(message)
@@ -52,45 +52,32 @@ def run[Config](
     with edge():
         from lerobot_constructskill.parsing import parse
 
-        flags, epilog = _put_names(sys.argv[1:], first), EPILOG
-        if presets:
-            flags, epilog = _put_file(flags, presets), f"{_tell_names(presets)} {EPILOG}"
-        say(action(parse(config_class, flags, epilog=epilog)))
+        shipped = ", ".join(names(presets)) if presets else ""
+        told = f"Instead of --config_path, the first argument can be a file or a name: {shipped}. "
+        flags = _put_names(sys.argv[1:], ("config_path",) if presets else first, presets)
+        say(action(parse(config_class, flags, epilog=(told if presets else "") + EPILOG)))
 
 
-def _put_names(flags: list[str], first: Sequence[str]) -> list[str]:
-    """Put the names of fields before values that come before all flags."""
+def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> list[str]:
+    """Put the names of fields before values that come before all flags; of `presets` a value is a name or a file."""
     values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
     if len(values) > len(first):
         raise InputError(
-            f"Before the flags stand {' and '.join(first)}, not {len(values)} values: put a pattern in quotation "
-            "marks, so that the shell leaves it alone."
+            f"{len(values)} values stand before the flags, where {' and '.join(first)} can stand: put a pattern in "
+            "quotation marks, so that the shell leaves it alone."
         )
-    others = flags[len(values) :]
+    named, others = [], flags[len(values) :]
     for name, value in zip(first, values, strict=False):
         if any(flag.split("=")[0] == f"--{name}" for flag in others):
             raise InputError(f"'{value}' and --{name} are two values of one field; give only one.")
-    return [*(f"--{name}={value}" for name, value in zip(first, values, strict=False)), *others]
-
-
-def _put_file(flags: list[str], kind: str) -> list[str]:
-    """Replace a name or file that comes before all flags by `--config_path`."""
-    if not flags or flags[0].startswith("-"):
-        return flags
-    name, *others = flags
-    if any(flag.split("=")[0] == "--config_path" for flag in others):
-        raise InputError(f"'{name}' and --config_path are two configurations; give only one.")
-    return [f"--config_path={find(kind, name)}", *others]
-
-
-def _tell_names(kind: str) -> str:
-    return f"Instead of --config_path, the first argument can be a file or a name: {', '.join(names(kind))}."
+        named.append(f"--{name}={find(presets, value) if presets else value}")
+    return [*named, *others]
 
 
 @contextmanager
 def edge() -> Iterator[None]:
-    """Turn what a command raises into one sentence and an exit status, and keep its traceback in a log."""
-    # Torch reads it when it is imported. Else its threads spin while they wait for one that another process holds up.
+    """Turn what a command raises into one sentence and an exit status, and keep the traceback in a log."""
+    # Torch reads this when it is imported. By default its threads spin while they wait for each other.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command, debug = list(sys.argv), DEBUG in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != DEBUG]
@@ -107,10 +94,10 @@ def edge() -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Have somewhere to write to, whatever the shell closed and whatever letters its locale has."""
+    """Open streams that the shell has closed, and escape letters that its locale lacks."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:
-            with suppress(OSError):  # the next file would have its number, and be written into
+            with suppress(OSError):  # else the next file gets the number of the stream, and its output
                 os.dup2(os.open(os.devnull, os.O_RDWR), number)
             setattr(sys, name, open(os.devnull, "r+", encoding="utf-8"))  # noqa: SIM115  for good
     for stream in (sys.stdout, sys.stderr):
@@ -121,16 +108,16 @@ def _open_streams() -> None:
 
 @cache
 def _hear_no_destructors() -> None:
-    """A full disk is told in one sentence: the destructors of PyAV would tell it once more, in tracebacks."""
+    """Silence tracebacks of an `OSError` in destructors: PyAV's would repeat the sentence about a full disk."""
     of_errors, of_destructors = sys.excepthook, sys.unraisablehook
     sys.excepthook = lambda kind, error, trace: isinstance(error, OSError) or of_errors(kind, error, trace)
     sys.unraisablehook = lambda said: isinstance(said.exc_value, OSError) or of_destructors(said)
 
 
 def say(text: str) -> None:
-    """Print what a command has to say. That nobody can read it stops no work, and is said when that is done.
+    """Print a text. If standard output cannot be written to, the work goes on, and `edge` reports why at its end.
 
-    A reader who has read enough, such as `head`, is no fault.
+    A reader that has closed the pipe, such as `head`, is no error.
     """
     try:
         print(text, flush=True)
@@ -141,11 +128,11 @@ def say(text: str) -> None:
 
 
 _unread: list[OSError] = []
-"""Why standard output cannot be written to."""
+"""The error of writing to standard output, if there was one."""
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """LeRobot warns at every policy that there is no GPU, as most of our users know of their machine."""
+    """Whether a record is worth printing; LeRobot warns at every policy that there is no GPU."""
     return not record.getMessage().startswith("No accelerated backend detected")
 
 

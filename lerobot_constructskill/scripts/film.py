@@ -4,18 +4,36 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from lerobot_constructskill.bounds import Among, Seed, check
+from lerobot_constructskill.artifacts.folders import replaced
+from lerobot_constructskill.bounds import Among, Checked, Seed
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.parsing import tells_of_bases
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.scripts.console import run
-from lerobot_constructskill.scripts.no_noise import NoNoise
+
+
+@tells_of_bases
+@dataclass(frozen=True)
+class NoNoise(NoiseConfig):
+    """`NoiseConfig` for commands that add no noise by default; draccus takes no default from a field's value.
+
+    Args:
+        sigma: standard deviation per axis of `fixed`, in metres; none by default.
+    """
+
+    sigma: Sigma = 0.0
+
 
 View = Annotated[str, Among(("close", "policy"))]
 
 
 @dataclass
-class FilmConfig:
+class FilmConfig(Checked):
     """Film the scripted expert of a task in one episode, by default without noise."""
 
     task: str = "brick_to_bin"  # a name in `contract.TASKS`
@@ -27,8 +45,7 @@ class FilmConfig:
     perturb_seed: Seed = 0  # of what a perturbation draws once
 
     def __post_init__(self):
-        check(self)
-        Perturbation(self.perturb, self.perturb_seed).check(get_task(self.task))
+        super().__post_init__()
         if self.out is not None and self.out.suffix != ".mp4":
             raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
@@ -40,12 +57,7 @@ def film(config: FilmConfig) -> str:
         ValueError: no such task, view or perturbation.
         OSError: there is nothing to render with, or the video cannot be written.
     """
-    from lerobot_constructskill.artifacts.folders import replaced
-    from lerobot_constructskill.demos.demonstrate import demonstrate
-    from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
-    from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
     from lerobot_constructskill.lerobot_internals import write_video
-    from lerobot_constructskill.progress import Progress, quiet
 
     out = config.out or Path("outputs") / f"{config.task}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())
@@ -66,7 +78,3 @@ def film(config: FilmConfig) -> str:
 
 def main() -> None:
     run(FilmConfig, film)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,17 @@
-"""`constructskill-fit-noise`: one DART iteration: fit the noise of the next data set to a policy's errors."""
+"""`constructskill-fit-noise`: one iteration of DART (Laskey et al. 2017).
+
+Train on the demonstrations, fit the noise's covariance to the policy's error on held-out demonstrations, generate with
+that covariance. The expert's states under the noise are then those that the policy's own errors lead to.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
+
 from lerobot_constructskill.artifacts.folders import write_text
-from lerobot_constructskill.bounds import Device, Episodes, Range, RepoId, Text, check
+from lerobot_constructskill.bounds import Checked, Device, Episodes, Range, RepoId, Text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
@@ -16,7 +22,7 @@ Alpha = Annotated[float, Range(above=0, most=1, unit="m2")]
 
 
 @dataclass
-class FitNoiseConfig:
+class FitNoiseConfig(Checked):
     """Write the configuration of the next data set: that of the given set, with noise that is fitted to a policy."""
 
     policy_path: Text  # a checkpoint's `pretrained_model` folder, or a name on the Hub
@@ -29,9 +35,6 @@ class FitNoiseConfig:
     device: Device | None = None  # default: a GPU if there is one
     backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's
 
-    def __post_init__(self):
-        check(self)
-
 
 def fit_noise(config: FitNoiseConfig) -> str:
     """Fit, write `config.out` and return a line that says what came out.
@@ -41,13 +44,11 @@ def fit_noise(config: FitNoiseConfig) -> str:
         ValueError: no such episodes, none in which the expert drives, nothing to fit on, or a policy with other
             actions or observations.
     """
-    import numpy as np
     import yaml
     from lerobot.utils import auto_select_torch_device
 
     from lerobot_constructskill.dataset.dataset import read_provenance
     from lerobot_constructskill.dataset.hub import choose_held_out, one_sentence, open_lerobot
-    from lerobot_constructskill.demos.dart import fit_covariance
     from lerobot_constructskill.demos.settings import GenerateConfig, generator_facts
     from lerobot_constructskill.parsing import decode
     from lerobot_constructskill.progress import Progress
@@ -82,6 +83,33 @@ def fit_noise(config: FitNoiseConfig) -> str:
     return f"Noise of {deviations} mm (x, y, z) from {plural(int(fitted_on['frames']), 'frame')}: {config.out}"
 
 
+def fit_covariance(errors: list[np.ndarray], alpha: float | None = None) -> np.ndarray:
+    """Mean over episodes of the mean of e e^T, which is large where the policy is biased too.
+
+    Args:
+        errors: one (n, 3) array per episode, in metres.
+        alpha: scale the covariance so that the squared error of an episode of mean length sums to this, in m2.
+
+    Returns:
+        (3, 3) in m2
+
+    Raises:
+        ValueError: no episode has an error, or alpha is not above 0, or nothing to scale to it.
+    """
+    errors = [error for error in errors if len(error)]
+    if not errors:
+        raise InputError("The held-out episodes have no frame in a perturbed phase to fit noise on.")
+    if alpha is not None and not alpha > 0:
+        raise InputError(f"alpha must be above 0 m2, not {alpha}.")
+    covariance = np.mean([error.T @ error / len(error) for error in errors], axis=0)
+    if alpha is None:
+        return covariance
+    if not np.trace(covariance) > 0:
+        raise InputError("The policy has no error on the held-out episodes, so there is nothing to scale to alpha.")
+    length = np.mean([len(error) for error in errors])
+    return covariance * alpha / (length * np.trace(covariance))
+
+
 def _by_the_expert(dataset: "LeRobotDataset", episodes: list[int]) -> list[int]:
     """Those in which the expert drives: in DAgger's rounds the states are the learner's."""
     if "dagger.round" not in dataset.meta.features:
@@ -95,7 +123,3 @@ def _by_the_expert(dataset: "LeRobotDataset", episodes: list[int]) -> list[int]:
 
 def main() -> None:
     run(FitNoiseConfig, fit_noise)
-
-
-if __name__ == "__main__":
-    main()

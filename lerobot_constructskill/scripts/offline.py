@@ -8,17 +8,17 @@ from typing import Annotated
 
 from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced, write_text
-from lerobot_constructskill.artifacts.store import SPEC, SPECIFICATION
-from lerobot_constructskill.bounds import BatchSize, Device, Episodes, NotEmpty, RepoId, Seed, Text, check
+from lerobot_constructskill.bounds import BatchSize, Checked, Device, Episodes, NotEmpty, RepoId, Seed, Text
 from lerobot_constructskill.errors import MissingError, plural
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.training.recipe import FACTS, SAID
 
 Patterns = Annotated[list[Text], NotEmpty()]
 
 
 @dataclass
-class OfflineConfig:
+class OfflineConfig(Checked):
     """Print and write a table of translation errors in metres, gripper accuracy and chunk consistency."""
 
     policies: Patterns  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
@@ -32,9 +32,6 @@ class OfflineConfig:
     device: Device | None = None  # default: that of the checkpoint
     backbone_precision: Text | None = None  # of frozen_vit, if this machine would emulate the checkpoint's
 
-    def __post_init__(self):
-        check(self)
-
 
 SHOWN = ("policy", "training_seed", "rmse_m", "mean_m", "gripper_accuracy", "gripper_change_accuracy", "consistency_m")
 """Columns that are printed; the files have all."""
@@ -45,7 +42,7 @@ TYPES = {
     "gripper_change_accuracy": float,
     "consistency_m": float,
 }
-"""Columns in which a value can be missing."""
+"""Types of columns in which a value can be missing."""
 
 
 def evaluate_offline(config: OfflineConfig) -> str:
@@ -55,6 +52,8 @@ def evaluate_offline(config: OfflineConfig) -> str:
         FileNotFoundError: there is no such checkpoint or data set.
         ValueError: no such episodes.
     """
+    import pandas as pd
+
     from lerobot_constructskill.dataset.hub import choose_held_out, open_lerobot
     from lerobot_constructskill.progress import Progress
 
@@ -69,18 +68,20 @@ def evaluate_offline(config: OfflineConfig) -> str:
     }
     bar = Progress(checkpoints, "policies", unit="policy")
     rows = [_row(path, dataset, episodes, config) | source for path in bar]
-    return _write(rows, config.out)
+    table = pd.DataFrame(rows).astype(TYPES)
+    write_text(config.out / "offline.json", json.dumps(rows, indent=2) + "\n")
+    with replaced(config.out / "offline.parquet") as partial:
+        table.to_parquet(partial, index=False)
+    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
+    return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {config.out / 'offline.json'} and .parquet"
 
 
 def _find(patterns: list[str]) -> list[Path]:
     """Checkpoints that the patterns match, in their order."""
-    found = []
-    for pattern in patterns:
-        folders = [Path(name) for name in sorted(glob(pattern)) if (Path(name) / "config.json").is_file()]
-        if not folders:
-            raise MissingError(f"'{pattern}' matches no checkpoint's pretrained_model folder.")
-        found += folders
-    return found
+    found = {pattern: sorted(glob(f"{pattern}/config.json")) for pattern in patterns}
+    if missing := [pattern for pattern, files in found.items() if not files]:
+        raise MissingError(f"'{missing[0]}' matches no checkpoint's pretrained_model folder.")
+    return [Path(file).parent for files in found.values() for file in files]
 
 
 def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) -> dict:
@@ -115,27 +116,12 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
 
 
 def _training_seed(checkpoint: Path) -> int | None:
-    """As `lerobot-train` keeps it, or a study."""
-    for name, kind in ((TRAIN_CONFIG, TRAINED), (SPEC, SPECIFICATION)):
+    """The seed that `lerobot-train` or a study wrote beside a checkpoint."""
+    for name, kind in ((TRAIN_CONFIG, TRAINED), (FACTS, SAID)):
         if (checkpoint / name).is_file():
             return kind.read(checkpoint / name).get("seed")
     return None
 
 
-def _write(rows: list[dict], folder: Path) -> str:
-    import pandas as pd
-
-    table = pd.DataFrame(rows).astype(TYPES)
-    write_text(folder / "offline.json", json.dumps(rows, indent=2) + "\n")
-    with replaced(folder / "offline.parquet") as partial:
-        table.to_parquet(partial, index=False)
-    shown = table[list(SHOWN)].to_string(index=False, na_rep="n/a", float_format="%.4f")
-    return f"{shown}\n{plural(rows[0]['frames'], 'frame')}; every column: {folder / 'offline.json'} and .parquet"
-
-
 def main() -> None:
     run(OfflineConfig, evaluate_offline)
-
-
-if __name__ == "__main__":
-    main()

@@ -4,14 +4,14 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import RepoId, Word, check
+from lerobot_constructskill.bounds import Checked, RepoId, Word
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import read_text
 from lerobot_constructskill.scripts.console import run, say
 
 
 @dataclass
-class PushConfig:
+class PushConfig(Checked):
     """Check a data set, write its card, upload it to the Hub as one commit and tag it.
 
     A card that somebody changed, or another version wrote, stays as it is; others get this name.
@@ -25,9 +25,6 @@ class PushConfig:
     tag: Word | None = None  # a version tag of yours, beside LeRobot's tag
     update: bool = False  # replace a data set that is there already
 
-    def __post_init__(self):
-        check(self)
-
 
 def push_dataset(config: PushConfig) -> str:
     """Push and return the commit's address.
@@ -39,15 +36,13 @@ def push_dataset(config: PushConfig) -> str:
         OSError: the Hub refused, or the connection broke.
     """
     from lerobot_constructskill.dataset.card import card_facts, render
-    from lerobot_constructskill.dataset.checks import CHECKS, complaints
+    from lerobot_constructskill.dataset.checks import examine
     from lerobot_constructskill.dataset.dataset import open_dataset
     from lerobot_constructskill.dataset.hub import push
-    from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.scripts.card import CardConfig, write_card
 
     data = open_dataset(config.root)
-    checks = Progress(CHECKS.items(), "check", unit="check")
-    wrong = [f"{name}: {complaint}" for name, check in checks for complaint in complaints(data, check)]
+    wrong = [f"{name}: {complaint}" for name, found in examine(data) for complaint in found]
     if wrong:
         raise InputError(
             f"{config.root} is not pushed, because the checks found {plural(len(wrong), 'fault')}; {wrong[0]}"
@@ -63,7 +58,3 @@ def push_dataset(config: PushConfig) -> str:
 
 def main() -> None:
     run(PushConfig, push_dataset)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,18 +1,24 @@
-"""`constructskill-push-policy`: upload a trained policy to the Hub by LeRobot's own push, outcomes on its card."""
+"""`constructskill-push-policy`: upload a checkpoint to the Hub, with its outcomes on its card."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from lerobot_constructskill.bounds import RepoId, check
-from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.errors import MissingError
-from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
+from lerobot_constructskill.bounds import Checked, RepoId
+from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_task
+from lerobot_constructskill.dataset.card import render_template
+from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import run
+
+PUSHED = ["*.safetensors", "*.json"]
+"""Files of a checkpoint that leave the machine: weights, configurations and processors."""
 
 
 @dataclass
-class PushPolicyConfig:
-    """Upload a checkpoint; its card also has the lifts and placements of every evaluated training seed."""
+class PushPolicyConfig(Checked):
+    """Upload a checkpoint; its card has the lifts and placements of every evaluated training seed."""
 
     policy_path: Path  # a checkpoint's `pretrained_model` folder
     evaluations: Path  # folder of seed_*/eval_info.json, as lerobot-eval writes them
@@ -20,58 +26,83 @@ class PushPolicyConfig:
     task: str  # the task of its evaluation, as `--env.task`
     private: bool = False  # whether only its owner sees it
 
-    def __post_init__(self):
-        check(self)
-        get_task(self.task)
-
 
 def push_policy(config: PushPolicyConfig) -> str:
     """Push and return the name.
 
     Raises:
         FileNotFoundError: there is no checkpoint, or no evaluation.
+        ValueError: there is no such task.
         OSError: the Hub refused, or the connection broke.
     """
+    from huggingface_hub import HfApi
+
     from lerobot_constructskill.dataset.dataset import read_facts
     from lerobot_constructskill.dataset.hub import check_private, one_sentence
-    from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 
     for name in (TRAIN_CONFIG, "config.json"):
         if not (config.policy_path / name).is_file():
             raise MissingError(f"{config.policy_path / name} is missing: name a checkpoint's pretrained_model folder.")
     train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), read_facts(config.policy_path, "config.json")
-    has_record = (config.policy_path / "encoder.json").is_file()
-    encoder = read_facts(config.policy_path, "encoder.json") if has_record else None
-    section = render_outcomes(seed_outcomes(config.evaluations), config.task, train, policy, encoder)
+    record = config.policy_path / "encoder.json"
+    encoder = read_facts(config.policy_path, record.name) if record.is_file() else {}
+    outcomes, task = seed_outcomes(config.evaluations), get_task(config.task).name
+    card, api = render_card(config.repo_id, outcomes, task, train, policy, encoder), HfApi()
     with one_sentence(config.repo_id):
+        api.create_repo(config.repo_id, private=config.private, exist_ok=True)
         if config.private:
             check_private(config.repo_id)
-        _push(config, section, policy["device"])
+        api.upload_folder(repo_id=config.repo_id, folder_path=config.policy_path, allow_patterns=PUSHED)
+        api.upload_file(repo_id=config.repo_id, path_or_fileobj=card.encode(), path_in_repo="README.md")
     return f"Pushed: {config.repo_id}"
 
 
-def _push(config: PushPolicyConfig, section: str, device: str | None) -> None:
-    """Load it on any machine, and push it as it is: with the device that it was trained on."""
-    from huggingface_hub import HfApi, ModelCard
-    from lerobot.policies import get_policy_class
+def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
+    """Seed, lifted, placed and evaluated episodes of each `seed_*/eval_info.json` that lerobot-eval wrote.
 
-    from lerobot_constructskill.lerobot_internals import TrainPipelineConfig
-    from lerobot_constructskill.policy_types import read_policy
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    outcomes = {}
+    for path in folder.glob("seed_*/eval_info.json"):
+        if not re.fullmatch(r"seed_(0|[1-9][0-9]{0,9})", path.parent.name):
+            raise InputError(f"'{path.parent}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
+        lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
+        outcomes[int(path.parent.name.removeprefix("seed_"))] = lifted, placed, len(stages)
+    if not outcomes:
+        raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
+    return [(seed, *counts) for seed, counts in sorted(outcomes.items())]
 
-    policy_config = read_policy(config.policy_path)
-    policy_config.repo_id, policy_config.private, policy_config.device = config.repo_id, config.private, "cpu"
-    policy = get_policy_class(policy_config.type).from_pretrained(config.policy_path, config=policy_config)
-    policy.config.device = device
-    policy.push_model_to_hub(TrainPipelineConfig.from_pretrained(config.policy_path))
-    HfApi().upload_folder(repo_id=config.repo_id, folder_path=config.policy_path, allow_patterns="policy_*processor*")
-    card = ModelCard.load(config.repo_id)
-    card.text += section
-    card.push_to_hub(config.repo_id)
+
+def render_card(
+    repo_id: str,
+    outcomes: list[tuple[int, int, int, int]],
+    task: str,
+    train: dict[str, Any],
+    policy: dict[str, Any],
+    encoder: dict[str, Any],
+) -> str:
+    """The card of a policy, in Markdown.
+
+    Args:
+        train: `train_config.json` (`TRAINED`).
+        policy: the checkpoint's `config.json`.
+        encoder: its `encoder.json`; empty for a policy without one.
+    """
+    data = train.get("dataset", {})
+    return render_template(
+        "policy_card.md.j2",
+        repo_id=repo_id,
+        outcomes=outcomes,
+        task=task,
+        this_seed=train.get("seed"),
+        dataset=data.get("repo_id"),
+        revision=data.get("revision"),
+        policy=policy,
+        encoder=encoder,
+    )
 
 
 def main() -> None:
     run(PushPolicyConfig, push_policy)
-
-
-if __name__ == "__main__":
-    main()

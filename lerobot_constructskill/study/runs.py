@@ -32,8 +32,8 @@ from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
-from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of, made_of
-from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of
+from lerobot_constructskill.training.recipe import FACTS, SAID, Training
 from lerobot_constructskill.training.trainers import OF_THE_MACHINE, Learner
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
@@ -307,7 +307,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
     if run.checkpoints and job.store.has(run.checkpoints):
         model = _checkpoint(job, run) / "model.safetensors"
         weights = file_sha256(model) if model.exists() else None
-        stands_on = made_of(job.store.folder(run.checkpoints))
+        stands_on = SAID.read(_checkpoint(job, run) / FACTS)["made_of"]
     return EpisodeRow(
         run=run.digest,
         training_seed=run.seed,

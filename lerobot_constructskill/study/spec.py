@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
-from lerobot_constructskill.bounds import Among, Count, Pattern, Range, Seed, Text, Workers, check, check_values
+from lerobot_constructskill.bounds import Among, Count, Pattern, Range, Seed, Text, Workers, check, check_fields
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.training.recipe import Training
 
@@ -113,7 +113,7 @@ class Study:
                 f"'{twice[0]}' is the name of two things; settings, variants and references need different names."
             )
         for name, seeds in self.references.items():
-            check_values(Variant, {"seeds": seeds}, f"references.{name}: ")
+            check_fields(Variant, {"seeds": seeds}, f"references.{name}: ")
         for name, setting in self.settings.items():
             check(setting, f"settings.{name}.")
         for name, variant in self.variants.items():

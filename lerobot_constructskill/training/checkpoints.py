@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
@@ -16,8 +16,7 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Machine, Node
 from lerobot_constructskill.contract import OBS_TYPES, held_out
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.files import Json
-from lerobot_constructskill.training.recipe import Training
+from lerobot_constructskill.training.recipe import FACTS, Training
 from lerobot_constructskill.training.trainers import Learner, flush_denormals
 
 LEARNING = ("lerobot", "torch", "numpy")
@@ -25,16 +24,6 @@ LEARNING = ("lerobot", "torch", "numpy")
 
 ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
-
-FACTS = "training.json"
-"""File beside the checkpoints: what rows say of them."""
-
-
-class _Facts(TypedDict):
-    made_of: dict[str, str]
-
-
-SAID = Json("what a trainer says of its checkpoints", _Facts)
 
 
 def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
@@ -108,14 +97,11 @@ class Checkpoints(Node):
         kept_out = held_out(dataset.num_episodes, self.training.holdout)
         folder.mkdir()
         made_of = self.learner.trainer.fit(self.learner.here, dataset, self.seeds, self.training, kept_out, folder)
-        (folder / FACTS).write_text(json.dumps({"made_of": made_of}) + "\n", encoding="utf-8")
+        for seed in self.seeds:
+            facts = {"seed": seed, "training": asdict(self.training), "made_of": made_of}
+            (checkpoint_of(seed, folder) / FACTS).write_text(json.dumps(facts) + "\n", encoding="utf-8")
 
 
 def checkpoint_of(seed: int, folder: Path) -> Path:
     """The checkpoint of a seed in the folder of a `Checkpoints` node."""
     return folder / f"seed_{seed}"
-
-
-def made_of(folder: Path) -> dict[str, str]:
-    """What rows say of the checkpoints in a `Checkpoints` folder. Raises InputError where its file is damaged."""
-    return SAID.read(folder / FACTS)["made_of"]

@@ -1,10 +1,11 @@
 """How long and on what part of the demonstrations a policy is trained."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypedDict
 
 from lerobot_constructskill.bounds import BatchSize, Count, Range, check
 from lerobot_constructskill.contract import HELD_OUT_EVERY
+from lerobot_constructskill.files import Json
 
 
 @dataclass(frozen=True)
@@ -26,3 +27,20 @@ class Training:
 
     def __post_init__(self):
         check(self, "training.")
+
+
+class _Holdout(TypedDict):
+    holdout: int
+
+
+class _Facts(TypedDict):
+    seed: int
+    training: _Holdout
+    made_of: dict[str, str]
+
+
+FACTS = "training.json"
+"""File in each checkpoint of a study or of DAgger."""
+
+SAID = Json("what a study says of a checkpoint's training", _Facts)
+"""Its training seed, its recipe, and what rows say that it stands on."""

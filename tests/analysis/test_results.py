@@ -5,8 +5,8 @@ from pathlib import Path, PurePosixPath
 
 import pytest
 
-from lerobot_constructskill import tags
 from lerobot_constructskill.analysis.report import figures
+from lerobot_constructskill.parsing import read_fields
 from lerobot_constructskill.scripts.report import ReportConfig, report
 
 ROOT = Path(__file__).parents[2]
@@ -20,7 +20,7 @@ def one_and_nightly_the_others() -> list:
 
 
 def load(path: Path) -> dict:
-    return tags.read(path)
+    return read_fields(path)
 
 
 def last(data: str | None) -> str | None:

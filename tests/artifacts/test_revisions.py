@@ -17,7 +17,7 @@ from lerobot_constructskill.errors import InputError, MachineError
 INERT = {
     *("__init__.py", "py.typed", "plugin.py", "analysis", "artifacts", "board", "comparison", "dataset", "scripts"),
     # What these make of a user's words stands in specifications, and what they refuse is not made.
-    *("bounds.py", "errors.py", "files.py", "parsing.py", "policy_types.py", "presets.py", "progress.py", "tags.py"),
+    *("bounds.py", "errors.py", "files.py", "parsing.py", "policy_types.py", "presets.py", "progress.py"),
     *(f"study/{name}.py" for name in ("__init__", "plan", "rows", "session", "spec", "status", "table", "timing")),
     *("features/__init__.py", "study/validate.py"),  # the latter measures by `rollout`
 }

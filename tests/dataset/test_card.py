@@ -18,8 +18,7 @@ from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
-from lerobot_constructskill.demos.hashes import file_hashes
-from lerobot_constructskill.demos.modality import CONTRACT, modality
+from lerobot_constructskill.demos.metadata import CONTRACT, file_hashes, modality
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.interface import describe_task

@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import av
 import numpy as np
@@ -361,6 +362,6 @@ def test_the_command_prints_a_line_for_each_check_and_tells_by_its_status(pristi
 
 @pytest.mark.parametrize("flags, words", [([], "--repo_id"), (["--root=/nowhere"], "no folder /nowhere")])
 def test_what_is_not_there_is_told_in_one_sentence(flags, words):
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.check", *flags]
+    command = [Path(sys.executable).parent / "constructskill-check", *flags]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1 and words in done.stderr and len(done.stderr.strip().splitlines()) == 1

@@ -15,12 +15,12 @@ from lerobot_constructskill.dataset.card import card_facts
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.hub import PUSHED, open_lerobot
-from lerobot_constructskill.dataset.policy_card import render_outcomes, seed_outcomes
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import bounded_memory
 from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
+from lerobot_constructskill.scripts.push_policy import render_card, seed_outcomes
 
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
 BINARY = ("meta/tasks.parquet", "data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4")
@@ -95,7 +95,8 @@ def test_a_hostile_set_gets_no_card(pristine: Path, change) -> None:
 def test_a_policys_card_escapes_what_its_files_say(tmp_path: Path) -> None:
     hostile = "x`\n# Heading <script>[a](javascript:b)"
     train = {"seed": 0, "dataset": {"repo_id": hostile, "revision": hostile}}
-    card = render_outcomes([(0, 1, 1, 1)], "brick_to_bin", train, {"backbone": hostile}, {"source": hostile})
+    policy = {"backbone": hostile, "type": hostile}
+    card = render_card("me/mine", [(0, 1, 1, 1)], "brick_to_bin", train, policy, {"source": hostile})
     assert "<script>" not in card and "](" not in card and "\n# Heading" not in card
 
 

@@ -13,8 +13,8 @@ import pytest
 from hub_server import TOKENS, serve
 
 from lerobot_constructskill.contract import SUITES
-from lerobot_constructskill.dataset.hub import pull, push
-from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.dataset.hub import locate, push
+from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.errors import InputError, TakenError
 from lerobot_constructskill.scripts.card import CardConfig, write_card
 from lerobot_constructskill.scripts.push import PushConfig, push_dataset
@@ -105,7 +105,7 @@ def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine
     repo = hub.repos["datasets/alice/toy"]
     assert repo.private and set(repo.tags) == {"v3.0", "v1.0"} and repo.branches["main"] in url
     for revision, offline in (("v1.0", False), (repo.tags["v1.0"], False), (None, False), (None, True)):
-        pulled = machine(pull, "alice/toy", revision, offline=offline)
+        pulled = machine(locate, "alice/toy", None, revision, offline=offline)
         assert file_hashes(pulled) == file_hashes(pristine)
         assert "# alice/toy" in (pulled / "README.md").read_text() and (pulled / "pictures").is_dir()
     assert machine(count_frames, "alice/toy", "v3.0") == 1108
@@ -120,10 +120,10 @@ def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine)
     hub.uploads_left = None
     assert "same command continues" in said
     assert not hub.repos["datasets/alice/cut"].tags and len(hub.uploads) == 1
-    assert "no revision 'v3.0'" in refusal(machine, pull, "alice/cut")
+    assert "no revision 'v3.0'" in refusal(machine, locate, "alice/cut")
     machine(push, pristine, "alice/cut")
     assert len(hub.uploads) == len(set(hub.uploads)) > 2
-    assert file_hashes(machine(pull, "alice/cut")) == file_hashes(pristine)
+    assert file_hashes(machine(locate, "alice/cut")) == file_hashes(pristine)
 
 
 @pytest.mark.parametrize("update", [pytest.param(False, marks=pytest.mark.nightly), True])
@@ -190,7 +190,7 @@ def test_a_card_that_somebody_changed_is_pushed_as_it_is(hub, machine, copy):
         file.write("What our robot does with it.\n")
     changed = (copy / "README.md").read_bytes()
     machine(push_dataset, PushConfig("alice/changed", copy))
-    assert (machine(pull, "alice/changed") / "README.md").read_bytes() == changed
+    assert (machine(locate, "alice/changed") / "README.md").read_bytes() == changed
 
 
 def test_a_damaged_data_set_does_not_leave_the_machine(hub, copy):
@@ -231,10 +231,10 @@ def upload(folder, repo_id):
 
 def test_a_pull_that_cannot_be_is_one_sentence(hub, machine, pristine):
     machine(push, pristine, "alice/private", private=True)
-    assert "no 'alice/nothing' that this machine may see" in refusal(machine, pull, "alice/nothing")
-    assert "no 'alice/private' that this machine may see" in refusal(machine, pull, "alice/private", token=None)
-    assert "no revision 'v9.9'" in refusal(machine, pull, "alice/private", "v9.9")
-    assert "not in the cache" in refusal(machine, pull, "alice/private", "v3.0", offline=True)
+    assert "no 'alice/nothing' that this machine may see" in refusal(machine, locate, "alice/nothing")
+    assert "no 'alice/private' that this machine may see" in refusal(machine, locate, "alice/private", token=None)
+    assert "no revision 'v9.9'" in refusal(machine, locate, "alice/private", None, "v9.9")
+    assert "not in the cache" in refusal(machine, locate, "alice/private", None, "v3.0", offline=True)
 
 
 def load_envhub(repo_id, file):

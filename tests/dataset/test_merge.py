@@ -6,7 +6,7 @@ from lerobot.datasets import LeRobotDataset
 from toy import record_toy
 
 from lerobot_constructskill.demos import merge
-from lerobot_constructskill.demos.hashes import file_hashes
+from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.lerobot_internals import load_episodes
 
 

@@ -7,9 +7,9 @@ from commands import call
 from hub_server import TOKENS, serve
 from toy import ToyEnv
 
-from lerobot_constructskill.dataset.policy_card import seed_outcomes
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.scripts.push_policy import seed_outcomes
 
 TOKEN = next(iter(TOKENS))
 ENV = ["--env.type=constructskill", "--env.obs_type=pixels_agent_pos", "--env.episode_length=6"]
@@ -17,14 +17,6 @@ EVAL = [*ENV, "--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu
 ACT = ["--policy.type=act", "--policy.dim_model=64", "--policy.n_heads=2", "--policy.dim_feedforward=64"]
 SMALL = ["--policy.use_vae=false", "--policy.pretrained_backbone_weights=null", "--policy.device=cpu"]
 SHORT = ["--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", "--policy.push_to_hub=false", "--seed=7"]
-
-# A card is validated at the real Hub whatever HF_ENDPOINT says.
-PUSH_POLICY = """
-from huggingface_hub import RepoCard
-RepoCard.validate = lambda card, repo_type=None: None
-from lerobot_constructskill.scripts.push_policy import main
-main()
-"""
 
 
 @pytest.mark.sim
@@ -53,7 +45,7 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
         ]
         saved = json.loads((checkpoint / "config.json").read_text())
         (checkpoint / "config.json").write_text(json.dumps(saved | {"device": "cuda"}))  # trained on another machine
-        run("code", PUSH_POLICY, *flags)
+        run("constructskill-push-policy", *flags)
         run("lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
         files = hub.repos["models/alice/act"].commits[hub.repos["models/alice/act"].branches["main"]]
         card = hub.blobs[files["README.md"][0]].decode()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from lerobot_constructskill.contract import held_out
-from lerobot_constructskill.demos.dart import fit_covariance
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.scripts.check_task import CheckTaskConfig
 from lerobot_constructskill.scripts.film import FilmConfig
+from lerobot_constructskill.scripts.fit_noise import fit_covariance
 
 COVARIANCE = np.array([[9.0, 3.0, 0.0], [3.0, 4.0, -1.0], [0.0, -1.0, 1.0]]) * 1e-6
 FITTED = COVARIANCE.tolist()

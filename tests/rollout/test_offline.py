@@ -10,15 +10,14 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from lerobot.policies.factory import make_pre_post_processors
 
 from lerobot_constructskill.artifacts.digests import data_sha256
-from lerobot_constructskill.artifacts.store import SPEC
 from lerobot_constructskill.dataset import hub
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
-from lerobot_constructskill.policies.frozen_vit.train_seeds import heldout_mse, save_checkpoint, train_seeds
+from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
+from lerobot_constructskill.rollout.heldout import heldout_mse
 from lerobot_constructskill.rollout.offline import (
     Predictions,
     check_actions,
@@ -29,6 +28,7 @@ from lerobot_constructskill.rollout.offline import (
     predict,
 )
 from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
+from lerobot_constructskill.training.recipe import FACTS, Training
 
 EPISODES, CHUNK = [3, 7], 5
 SHIFT = np.array([0.001, -0.002, 0.002, 0], dtype=np.float32)
@@ -141,12 +141,17 @@ def test_rotation_is_apart_from_translation():
     assert metrics.rmse_m == 0 and metrics.rmse_rotation_rad == pytest.approx(0.1, abs=1e-6)
 
 
+def said(seed: int, holdout: int) -> dict:
+    """What a study says of a checkpoint."""
+    return {"seed": seed, "training": asdict(Training(holdout=holdout)), "made_of": {}}
+
+
 def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_set, tmp_path):
     """Of chunks of one step the error is that which training found on the same held-out episodes."""
     trained = train_seeds(config(chunk_size=1), feature_set, [0, 1], epochs=3, batch_size=16, held_out=EPISODES)
     for policy, seed in zip(trained, [0, 1], strict=True):
         save_checkpoint(policy, feature_set, tmp_path / f"checkpoint_{seed}")
-        (tmp_path / f"checkpoint_{seed}" / "spec.json").write_text(json.dumps({"seed": seed}))
+        (tmp_path / f"checkpoint_{seed}" / FACTS).write_text(json.dumps(said(seed, 8)))
     found = f"{tmp_path}/checkpoint_*"
     asked = OfflineConfig([found], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
     printed = evaluate_offline(asked)
@@ -154,9 +159,8 @@ def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_s
     assert "n/a" in printed and [row["policy"] for row in rows] == ["frozen_vit"] * 2
     assert list(table["training_seed"]) == [0, 1]
     assert list(table["rmse_m"]) == [row["rmse_m"] for row in rows]
-    preprocess, _ = make_pre_post_processors(trained[0].config, dataset_stats=feature_set.meta.stats)
-    errors = heldout_mse(trained, feature_set, EPISODES, preprocess)
-    for row, error in zip(rows, errors, strict=True):
+    for row, checkpoint in zip(rows, sorted(tmp_path.glob("checkpoint_*")), strict=True):
+        error = heldout_mse(checkpoint, feature_set, EPISODES)
         assert row["rmse_m"] ** 2 / 3 == pytest.approx(error, rel=1e-4)
     assert rows[0]["weights_sha256"] != rows[1]["weights_sha256"]
     assert rows[0]["dataset_sha256"] == rows[1]["dataset_sha256"] and rows[0]["episodes"] == "3,7"
@@ -171,8 +175,7 @@ def test_a_readout_of_patches_is_evaluated_on_their_features(readout, config, fe
     asked = OfflineConfig(found, "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
     evaluate_offline(asked)
     (row,) = json.loads((tmp_path / "offline.json").read_text())
-    preprocess, _ = make_pre_post_processors(trained.config, dataset_stats=feature_set.meta.stats)
-    (error,) = heldout_mse([trained], feature_set, EPISODES, preprocess)
+    error = heldout_mse(tmp_path / "checkpoint", feature_set, EPISODES)
     assert row["rmse_m"] ** 2 / 3 == pytest.approx(error, rel=1e-4)
 
 
@@ -259,8 +262,8 @@ def test_of_a_checkpoint_that_says_nothing_of_its_training_set_a_line_is_said(tm
         (
             (TRAIN_CONFIG, {"dataset": {"repo_id": "alice/encoded", "root": None}}, set(range(16))),
             (TRAIN_CONFIG, {"dataset": {"repo_id": "alice/encoded", "root": "gone"}}, None),
-            (SPEC, {"training": {"holdout": 8}}, set()),
-            (SPEC, {"training": {"holdout": 5}}, None),
+            (FACTS, said(0, 8), set()),
+            (FACTS, said(0, 5), None),
             ("no_file", {}, None),
         )
     ):

@@ -1,10 +1,12 @@
-"""What a data set says of its numbers: GR00T's `meta/modality.json` and our `meta/contract.json`."""
+"""What stands beside the frames of a data set: GR00T's `meta/modality.json`, our `meta/contract.json`, and hashes."""
 
 import json
 from pathlib import Path
 from typing import Any
 
+from lerobot_constructskill.artifacts.digests import file_sha256, files_below
 from lerobot_constructskill.contract import CAMERAS, GRIPPER, OBS_TYPES, ROTATION, STATE_NAMES, TRANSLATION, Task
+from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.interface import describe_task
 
 MODALITY, CONTRACT = "meta/modality.json", "meta/contract.json"
@@ -40,3 +42,9 @@ def _spans(parts: dict[str, tuple[str, ...]], names: tuple[str, ...]) -> dict[st
         if indices:
             spans[part] = {"start": indices[0], "end": indices[-1] + 1}
     return spans
+
+
+def file_hashes(root: Path) -> dict[str, str]:
+    """SHA-256 of all files of frames, videos and metadata by relative path, without the record of the hashes."""
+    names = (path.relative_to(root).as_posix() for path in files_below(root, "data", "videos", "meta"))
+    return {name: file_sha256(root / name) for name in names if name != SIDECAR}
