@@ -27,7 +27,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.study.rows import VARIANT
 
-BASES = {"PickPlaceEnv": "lerobot_constructskill.sim.scene", "PreciseEnv": "lerobot_constructskill.sim.precise"}
+BASES = {"PickPlaceEnv": "lerobot_constructskill.sim.scene", "StrictPlaceEnv": "lerobot_constructskill.sim.strict"}
 """Scenes whose conditions the docstrings of tasks name."""
 
 

@@ -274,7 +274,7 @@ def _spare_imports() -> None:
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
     """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
     try:
-        from lerobot_constructskill.sim.rendering import best_render_backend
+        from lerobot_constructskill.sim.backends import best_render_backend
     except ModuleNotFoundError:
         return light_robot, render_backend
     backend = best_render_backend() if render_backend == "auto" else render_backend

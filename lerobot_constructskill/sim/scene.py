@@ -3,7 +3,9 @@
 A task derives from `PickPlaceEnv`, loads its asset and, where the layout differs, sets four geometry constants.
 """
 
+from collections.abc import Callable
 from functools import cache
+from itertools import chain
 
 import numpy as np
 import sapien
@@ -14,7 +16,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
@@ -31,15 +33,12 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.sim.autocast import outside_autocast
+from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
 from lerobot_constructskill.sim.clipping import Clipping
-from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
 from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
-from lerobot_constructskill.sim.poses import looking_from, seen_from
-from lerobot_constructskill.sim.rendering import best_render_backend, machine_lacks
-from lerobot_constructskill.sim.shader import colour_shader
-from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
+from lerobot_constructskill.sim.robot import LightPanda, QuickPanda, seen_from
+from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, textured
 
 WALL = 0.005
 """Thickness of the bin's walls and floor, in metres (paper, section II)."""
@@ -67,6 +66,14 @@ def keep_software_renderer() -> sapien.render.RenderSystem:
     for each further environment.
     """
     return sapien.render.RenderSystem("cpu")
+
+
+def outside_autocast[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+    """Have a method compute in full precision, whatever autocast surrounds its call.
+
+    With `use_amp`, `lerobot-eval` steps its environments under the same autocast as the policy.
+    """
+    return torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(method))
 
 
 class PickPlaceEnv(BaseEnv):
@@ -220,14 +227,16 @@ class PickPlaceEnv(BaseEnv):
     def _load_scene(self, options: dict) -> None:
         self._load_hall()
         self._load_offcuts()
-        self.bin = self._load_bin()
+        builder = self.scene.create_actor_builder()
+        self._load_bin(builder)
+        builder.initial_pose = sapien.Pose(p=self.bin_position)
+        self.bin = builder.build_kinematic(name="bin")
         builder = self.scene.create_actor_builder()
         self._load_object(builder)
         builder.initial_pose = sapien.Pose(p=[*self.object_center, self.object_size[2] / 2])
         self.object = builder.build_dynamic(name="object")
         self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._placed = torch.zeros_like(self._lifted)
-        self._last_unsettled = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._placements: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._clipping = Clipping(self.num_envs, self.device)
 
     def _load_hall(self) -> None:
@@ -262,19 +271,19 @@ class PickPlaceEnv(BaseEnv):
         self.scene.add_directional_light(*self.draws.light([1, 1, -1], [0.9, 0.9, 0.9]), shadow=self.enable_shadow)
         self.scene.add_directional_light(*self.draws.light([0, 0, -1], [0.6, 0.6, 0.6]))
 
-    def _load_bin(self) -> Actor:
-        """A floor and four walls around `bin_interior`, standing on the ground."""
+    def _load_bin(self, builder: ActorBuilder) -> None:
+        """Give `builder` the receptacle's collision shapes and visuals; its origin is the middle of `bin_interior`.
+
+        By default a floor and four walls around `bin_interior`.
+        """
         x, y, z = (extent / 2 for extent in self.bin_interior)
         t = WALL / 2
         panels = [([0, 0, -z - t], [x + WALL, y + WALL, t])]
         panels += [([side * (x + t), 0, 0], [t, y + WALL, z]) for side in (-1, 1)]
         panels += [([0, side * (y + t), 0], [x, t, z]) for side in (-1, 1)]
-        builder = self.scene.create_actor_builder()
         for center, half_size in panels:
             builder.add_box_collision(sapien.Pose(center), half_size)
             builder.add_box_visual(sapien.Pose(center), half_size, material=(0.10, 0.22, 0.42))
-        builder.initial_pose = sapien.Pose(p=self.bin_position)
-        return builder.build_kinematic(name="bin")
 
     # Gymnasium
 
@@ -305,10 +314,8 @@ class PickPlaceEnv(BaseEnv):
             zero = torch.zeros_like(half_yaw)
             quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
             self.object.set_pose(Pose.create_from_pq(position, quaternion))
-            self._lifted[env_idx] = False
-            self._placed[env_idx] = False
-            self._last_unsettled[env_idx] = 0
-            self._clipping.steps[env_idx] = 0
+            for memory in (self._lifted, self._clipping.steps, *chain(*self._placements.values())):
+                memory[env_idx] = 0
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
         """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
@@ -362,17 +369,29 @@ class PickPlaceEnv(BaseEnv):
         is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
         self._lifted |= center[:, 2] >= LIFT_HEIGHT
-        settled = is_in_bin & is_gripper_open
-        self._last_unsettled = torch.where(settled, self._last_unsettled, self.elapsed_steps)
-        self._placed |= self.elapsed_steps - self._last_unsettled >= PLACED_STEPS
+        is_placed = self._has_lasted("is_placed", is_in_bin & is_gripper_open)
         return {
             "is_lifted": self._lifted.clone(),
             "is_in_bin": is_in_bin,
             "is_gripper_open": is_gripper_open,
-            "is_placed": self._placed.clone(),
-            "success": self._placed.clone(),
+            "is_placed": is_placed,
+            "success": is_placed.clone(),
             "clipped_steps": self._clipping.steps.clone(),
         }
+
+    def _has_lasted(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
+        """Whether a condition was met in `PLACED_STEPS` consecutive steps of the episode, (num_envs,) booleans.
+
+        Args:
+            name: of the condition, by which its memory is kept.
+            is_met: whether it is met now, (num_envs,).
+        """
+        new = torch.zeros_like(is_met), torch.zeros_like(self.elapsed_steps)
+        has_lasted, last_unmet = self._placements.get(name, new)
+        last_unmet = torch.where(is_met, last_unmet, self.elapsed_steps)
+        has_lasted = has_lasted | (self.elapsed_steps - last_unmet >= PLACED_STEPS)
+        self._placements[name] = has_lasted, last_unmet
+        return has_lasted.clone()
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:
         """The stage reached, of shape (num_envs,)."""
@@ -386,11 +405,6 @@ class PickPlaceEnv(BaseEnv):
         if "state" in self.obs_mode:
             extra |= {"object_pose": self.object.pose.raw_pose, "bin_position": self.bin.pose.p}
         return extra
-
-    @property
-    def object_mass(self) -> float:
-        """In kilograms."""
-        return float(self.object.mass[0])
 
     @outside_autocast
     def agent_state(self) -> torch.Tensor:
@@ -407,20 +421,20 @@ class PickPlaceEnv(BaseEnv):
     @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
         """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
+        joints = self.agent.robot.get_qpos()
         constants = {
             "object_size": self.object_size,
-            "object_mass": [self.object_mass],
+            "object_mass": [float(self.object.mass[0])],
             "bin_interior": self.bin_interior,
         }
-        joints = self.agent.robot.get_qpos()
-        state = {
+        return {
             "tcp_pose": self.agent.tcp.pose.raw_pose,
             "fingers": joints[:, -2:],
             "object_pose": self.object.pose.raw_pose,
             "bin_position": self.bin.pose.p,
             "joint_positions": joints,
             "joint_velocities": self.agent.robot.get_qvel(),
+        } | {
+            name: torch.tensor(value, device=self.device).expand(self.num_envs, -1)
+            for name, value in constants.items()
         }
-        for name, value in constants.items():
-            state[name] = torch.tensor(value, device=self.device).expand(self.num_envs, -1)
-        return state
