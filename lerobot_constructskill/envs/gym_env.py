@@ -19,6 +19,7 @@ from lerobot_constructskill.contract import (
     LADDER,
     OBS_TYPES,
     STATE_NAMES,
+    Task,
     get_task,
 )
 from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
@@ -31,7 +32,22 @@ ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
 RenderBackend = Annotated[str, Among((*SEEING, "none"))]
 
-UNBORN = "Call reset() first: the simulator is born on the first reset."
+NOT_STARTED = "Call reset() first: the simulator starts with the first reset."
+
+
+def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Perturbation]:
+    """The task and its perturbation.
+
+    Raises:
+        InputError: no such task, axis or level, or a brick of another size where none is or where it does not fit.
+    """
+    task, perturbation = get_task(name), Perturbation(perturb, perturb_seed)
+    perturbation.check(task)
+    if perturbation.amount("size") and name in LADDER:
+        from lerobot_constructskill.sim.perturb import Draws, check_fits
+
+        check_fits(Draws(perturbation).brick(BRICK), LADDER[name])
+    return task, perturbation
 
 
 class ConstructSkillEnv(gym.Env):
@@ -43,7 +59,7 @@ class ConstructSkillEnv(gym.Env):
     the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success`, the named booleans of the scene
     and `clipped_steps`, how many of the episode's actions were clipped; after a reset also `contract`, as JSON.
 
-    Non-obvious behaviours: the simulator is born on the first `reset`, in the process that calls it, so
+    Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
 
     Args:
@@ -77,11 +93,8 @@ class ConstructSkillEnv(gym.Env):
         cameras: tuple[str, ...] | None = None,
     ):
         check_values(ConstructSkillEnv.__init__, locals())
-        self._perturbation = Perturbation(perturb, perturb_seed)
-        self._row = get_task(task)
-        self._perturbation.check(self._row)
+        self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed)
         self.task = task
-        self._check_fits()
         self.task_description = self._row.instruction
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
@@ -89,8 +102,13 @@ class ConstructSkillEnv(gym.Env):
         if not set(offered).issuperset(cameras := offered if cameras is None else cameras) or not cameras:
             raise InputError(f"cameras must be some of {', '.join(offered)}, which {obs_type} has, not {cameras}.")
         self.cameras = () if render_backend == "none" else tuple(name for name in offered if name in cameras)
-        self._told = {"task": task, "episode_length": self._max_episode_steps, "obs_type": obs_type}
-        self._told |= {"perturb": perturb, "perturb_seed": perturb_seed}
+        self._settings = {
+            "task": task,
+            "episode_length": self._max_episode_steps,
+            "obs_type": obs_type,
+            "perturb": perturb,
+            "perturb_seed": perturb_seed,
+        }
         self._scene_kwargs = {
             "cameras": self.cameras,
             "light_robot": light_robot,
@@ -98,24 +116,14 @@ class ConstructSkillEnv(gym.Env):
             "perturbation": self._perturbation,
         }
         self._env = None
-        self._has_started = False
-        self._steps = 0
+        self._steps: int | None = None  # of the episode; None where none has begun
         self._recording = None
-        self.observation_space = self._make_observation_space()
-        self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
-
-    def _check_fits(self) -> None:
-        if self._perturbation.amount("size") and self.task in LADDER:
-            from lerobot_constructskill.sim.perturb import Draws, check_fits
-
-            check_fits(Draws(self._perturbation).brick(BRICK), LADDER[self.task])
-
-    def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         space = {"pixels": spaces.Dict(dict.fromkeys(self.cameras, image))}
-        if self.obs_type == "pixels_agent_pos":
+        if obs_type == "pixels_agent_pos":
             space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
-        return spaces.Dict(space)
+        self.observation_space = spaces.Dict(space)
+        self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
 
     # Gymnasium
 
@@ -127,14 +135,13 @@ class ConstructSkillEnv(gym.Env):
         if seed is None:
             seed = int(self.np_random.integers(2**31))
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
-        obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
-        self._has_started = True
+        obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": bool(self._steps)})
         self._steps = 0
         self._pixel_rngs = {
             name: np.random.default_rng([seed, self._perturbation.seed, zlib.crc32(f"sensor {name}".encode())])
             for name in self.cameras
         }
-        self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
+        self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._settings)
         return self._observation(obs), self._info(info) | {"contract": json.dumps(self.contract)}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -161,8 +168,7 @@ class ConstructSkillEnv(gym.Env):
     def close(self) -> None:
         if self._env is not None:
             self._env.close()
-            self._env = None
-            self._has_started = False
+            self._env = self._steps = None
 
     @property
     def contract(self) -> dict[str, Any]:
@@ -224,8 +230,8 @@ class ConstructSkillEnv(gym.Env):
         return self._env
 
     def _started(self) -> gym.Env:
-        if not self._has_started:
-            raise RuntimeError(UNBORN)
+        if self._steps is None:
+            raise RuntimeError(NOT_STARTED)
         return self._env
 
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:
@@ -239,12 +245,10 @@ class ConstructSkillEnv(gym.Env):
         return scaled
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
-        # In one piece: what has gaps takes four times as long to be sent to another process.
+        # Contiguous: an array with gaps takes four times as long to be sent to another process.
         pictures = {name: obs["sensor_data"][name]["rgb"][0].contiguous().cpu().numpy() for name in self.cameras}
         pixels = {name: self._sensed(name, picture) for name, picture in pictures.items()}
-        if self.obs_type == "pixels":
-            return {"pixels": pixels}
-        return {"pixels": pixels, "agent_pos": self.agent_state()}
+        return {"pixels": pixels} | ({} if self.obs_type == "pixels" else {"agent_pos": self.agent_state()})
 
     def _sensed(self, camera: str, image: np.ndarray) -> np.ndarray:
         """`image`, (H, W, 3) uint8, as a noisy sensor sees it."""
@@ -255,8 +259,13 @@ class ConstructSkillEnv(gym.Env):
         return np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
-        booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
-        return {"is_success": bool(info["success"][0]), **booleans, "clipped_steps": int(info["clipped_steps"][0])}
+        return {name: value[0].item() for name, value in said(info).items()}
+
+
+def said(info: dict[str, Any]) -> dict[str, Any]:
+    """What users are told of ManiSkill's info, tensors (num_envs,): booleans, and the number of clipped steps."""
+    booleans = {name: value for name, value in info.items() if name.startswith("is_")}
+    return {"is_success": info["success"], **booleans, "clipped_steps": info["clipped_steps"]}
 
 
 @functools.cache

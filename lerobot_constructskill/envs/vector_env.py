@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.envs.gym_env import UNBORN, ConstructSkillEnv
+from lerobot_constructskill.envs.gym_env import NOT_STARTED, ConstructSkillEnv, said
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError
 
@@ -56,7 +56,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         self._env = None
         self._steps = 0
         self._done = np.zeros(n_envs, dtype=bool)
-        self._terminal: tuple | None = None
+        self._last: tuple | None = None
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -89,19 +89,18 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        self._check_started()
+        env = self._started()
         scaled = np.stack([self._single.maniskill_action(action) for action in actions])
-        obs, reward, terminated, _, info = self._env.step(scaled)
+        obs, reward, terminated, _, info = env.step(scaled)
         self._steps += 1
         truncated = np.full(self.num_envs, self._steps >= self._single._max_episode_steps)
         outcome = reward.cpu().numpy(), terminated.cpu().numpy(), truncated
-        transition = self._observations(obs), *outcome, self._infos(info)
-        if self._done.any():
-            transition = _keep(self._terminal, transition, self._done)
-        obs, reward, terminated, truncated, info = transition
-        self._terminal = obs, np.zeros_like(reward), terminated, truncated, info
+        obs, reward, terminated, truncated, info = _keep(
+            self._last, (self._observations(obs), *outcome, self._infos(info)), self._done
+        )
+        self._last = obs, np.zeros_like(reward), terminated, truncated, info
         self._done = terminated | truncated
-        return transition
+        return obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...]:
         """A close-up of every environment, each (H, W, 3) uint8.
@@ -109,8 +108,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        self._check_started()
-        return tuple(self._env.render().cpu().numpy())
+        return tuple(self._started().render().cpu().numpy())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """The attribute or method `name` of every environment."""
@@ -127,9 +125,10 @@ class NativeVectorEnv(gym.vector.VectorEnv):
             self._env.close()
             self._env = None
 
-    def _check_started(self) -> None:
+    def _started(self) -> gym.Env:
         if self._env is None:
-            raise RuntimeError(UNBORN)
+            raise RuntimeError(NOT_STARTED)
+        return self._env
 
     def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
         cameras = self._single.cameras
@@ -139,12 +138,13 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         return seen
 
     def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
-        names = [name for name in info if name.startswith("is_")] + ["clipped_steps"]
-        return {"is_success": info["success"].cpu().numpy(), **{name: info[name].cpu().numpy() for name in names}}
+        return {name: value.cpu().numpy() for name, value in said(info).items()}
 
 
 def _keep(old: Any, new: Any, frozen: np.ndarray) -> Any:
     """`new` with the rows of `old` where `frozen`, through tuples and dicts of arrays."""
+    if not frozen.any():
+        return new
     if isinstance(new, tuple):
         return tuple(_keep(a, b, frozen) for a, b in zip(old, new, strict=True))
     if isinstance(new, dict):
