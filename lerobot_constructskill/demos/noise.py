@@ -1,6 +1,7 @@
 """Noise on the executed action (Laskey et al. 2017): Gaussian, of a covariance that is fixed or was fitted."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -54,7 +55,7 @@ class NoiseConfig:
         if self.covariance is not None:
             _check_covariance(self.covariance)
 
-    @property
+    @cached_property
     def root(self) -> np.ndarray:
         """Symmetric square root of the covariance that is drawn from, (3, 3) in metres."""
         if self.model == "fixed":

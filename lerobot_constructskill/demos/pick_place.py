@@ -1,12 +1,13 @@
 """The six-phase expert of every pick-and-place task: above, down, grasp, lift, carry, release."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
 from lerobot_constructskill.demos.advice import Memoryless
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, Progress
+from lerobot_constructskill.demos.state import PrivilegedState
 
 GRAVITY = 9.81  # m/s2
 
@@ -40,14 +41,10 @@ class PickPlaceExpert(Memoryless):
 
     def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]:
         while self._is_over(state, progress):
-            following = PHASES.index(progress.phase) + 1
-            if following == len(PHASES):
-                break
-            progress = Progress(PHASES[following], 0, state.tcp)
-        phase = progress.phase
+            progress = Progress(PHASES[PHASES.index(progress.phase) + 1], 0, state.tcp)
         action = self._action(state, progress).astype(np.float32)
-        after = progress.step()
-        return action, phase, None if self._is_last(state, after) else after
+        after = replace(progress, steps=progress.steps + 1)
+        return action, progress.phase, None if self._is_last(state, after) else after
 
     def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
         """Whether the demonstration is over with the action that led to `after`."""
@@ -57,6 +54,7 @@ class PickPlaceExpert(Memoryless):
         return np.array([*self._translation(state, progress), GRIPPER[progress.phase]])
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+        """Whether the phase has ended and the next one begins; RELEASE is the last."""
         if progress.phase is Phase.GRASP:
             return progress.steps >= self.config.grasp_dwell
         if progress.phase is Phase.RELEASE:
@@ -72,8 +70,7 @@ class PickPlaceExpert(Memoryless):
         return self._toward(error, self.config.load_max_step) + self._weight_compensation(state)
 
     def _weight_compensation(self, state: PrivilegedState) -> np.ndarray:
-        weight = GRAVITY * state.object_mass[0]
-        return np.array([0, 0, self.config.compliance * weight])
+        return np.array([0, 0, self.config.compliance * (GRAVITY * state.object_mass[0])])
 
     def _toward(self, error: np.ndarray, longest: float) -> np.ndarray:
         return np.clip(self.config.gain * error, -longest, longest)

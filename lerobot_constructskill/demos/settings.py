@@ -93,11 +93,8 @@ def check_apart(starts: Mapping[str, range]) -> None:
 
 
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What the data set says of its generation; nothing of where and how fast it ran."""
-    facts = asdict(config)
-    for name in ("root", "workers", "executor"):
-        del facts[name]
-    return facts
+    """The settings that a data set records: all but where and how fast it was generated."""
+    return {name: value for name, value in asdict(config).items() if name not in ("root", "workers", "executor")}
 
 
 def frames_digest(config: GenerateConfig) -> str:
@@ -105,9 +102,8 @@ def frames_digest(config: GenerateConfig) -> str:
 
     What rendered a shard is known when it is there: `merge` refuses a mixture.
     """
-    facts = generator_facts(config)
-    for name in ("repo_id", "episodes", "max_failures", "seed_start"):
-        del facts[name]
+    others = ("repo_id", "episodes", "max_failures", "seed_start")
+    facts = {name: value for name, value in generator_facts(config).items() if name not in others}
     return digest(facts | frame_facts(config) | {"versions": frame_versions(config.task)})
 
 
