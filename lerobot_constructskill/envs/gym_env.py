@@ -32,8 +32,6 @@ ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
 RenderBackend = Annotated[str, Among((*SEEING, "none"))]
 
-NOT_STARTED = "Call reset() first: the simulator starts with the first reset."
-
 
 def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Perturbation]:
     """The task and its perturbation.
@@ -80,6 +78,9 @@ class ConstructSkillEnv(gym.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
     render_mode = "rgb_array"
+
+    num_copies = 1
+    """Copies of the task in the simulator; `NativeVectorEnv` steps several."""
 
     def __init__(
         self,
@@ -134,9 +135,7 @@ class ConstructSkillEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
-        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
-        obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": bool(self._steps)})
-        self._steps = 0
+        obs, info = self.begin(seed)
         self._pixel_rngs = {
             name: np.random.default_rng([seed, self._perturbation.seed, zlib.crc32(f"sensor {name}".encode())])
             for name in self.cameras
@@ -151,9 +150,8 @@ class ConstructSkillEnv(gym.Env):
             RuntimeError: before the first `reset`.
             ValueError: an action of another shape, or not finite.
         """
-        obs, reward, terminated, _, info = self._started().step(self.maniskill_action(action))
-        self._steps += 1
-        terminated, truncated, info = bool(terminated[0]), self._steps >= self._max_episode_steps, self._info(info)
+        obs, reward, terminated, truncated, info = self.advance(self.maniskill_action(action))
+        terminated, info = bool(terminated[0]), self._info(info)
         if self._recording is not None:
             self._recording.add(action, info)
             if terminated or truncated:
@@ -163,7 +161,7 @@ class ConstructSkillEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """A close-up of the scene, (H, W, 3) uint8. Raises as `step` does."""
-        return self._started().render()[0].cpu().numpy()
+        return self.started().render()[0].cpu().numpy()
 
     def close(self) -> None:
         if self._env is not None:
@@ -179,12 +177,12 @@ class ConstructSkillEnv(gym.Env):
 
     def privileged_state(self) -> dict[str, np.ndarray]:
         """The simulator's state, `contract.SIM_STATE` name to float32 array. Raises as `step` does."""
-        state = self._started().privileged_state()
+        state = self.started().privileged_state()
         return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
 
     def agent_state(self) -> np.ndarray:
         """Proprioception as `contract.STATE_NAMES` names it, (8,) float32. Raises as `step` does."""
-        return self._started().agent_state()[0].cpu().numpy().astype(np.float32)
+        return self.started().agent_state()[0].cpu().numpy().astype(np.float32)
 
     @property
     def light_robot(self) -> bool:
@@ -199,8 +197,8 @@ class ConstructSkillEnv(gym.Env):
 
     # ManiSkill
 
-    def make_scene(self, num_envs: int = 1) -> gym.Env:
-        """The task's ManiSkill environment; several copies of it in one simulator need a GPU.
+    def make_scene(self) -> gym.Env:
+        """The task's ManiSkill environment; several copies in one simulator need a GPU.
 
         Raises:
             InputError: the task is another package's, whose scene cannot be imported.
@@ -215,7 +213,7 @@ class ConstructSkillEnv(gym.Env):
         _spare_imports()
         return gym.make(
             self._row.env_id,
-            num_envs=num_envs,
+            num_envs=self.num_copies,
             obs_mode="rgb" if self.cameras else "none",
             reward_mode="sparse",
             render_mode="rgb_array" if self.cameras else None,
@@ -229,10 +227,28 @@ class ConstructSkillEnv(gym.Env):
             self._env = self.make_scene()
         return self._env
 
-    def _started(self) -> gym.Env:
+    def started(self) -> gym.Env:
+        """The ManiSkill environment of the episode that has begun.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+        """
         if self._steps is None:
-            raise RuntimeError(NOT_STARTED)
+            raise RuntimeError("Call reset() first: the simulator starts with the first reset.")
         return self._env
+
+    def begin(self, seed: int | list[int]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reset the ManiSkill environment; observation and info are as ManiSkill gives them, of all copies."""
+        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
+        result = self._ensure_env().reset(seed=seed, options={"reconfigure": bool(self._steps)})
+        self._steps = 0
+        return result
+
+    def advance(self, action: np.ndarray) -> tuple[dict[str, Any], Any, Any, bool, dict[str, Any]]:
+        """Step the ManiSkill environment by `action`, (7,) or (num_copies, 7); all copies are truncated together."""
+        obs, reward, terminated, _, info = self.started().step(action)
+        self._steps += 1
+        return obs, reward, terminated, self._steps >= self._max_episode_steps, info
 
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:
         """ManiSkill's normalised `pd_ee_delta_pose` action, (7,), for one of ours; the scene clips it to [-1, 1]."""
@@ -244,11 +260,18 @@ class ConstructSkillEnv(gym.Env):
         scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = normalised(action, names)
         return scaled
 
+    def observations(self, obs: dict[str, Any]) -> dict[str, Any]:
+        """The observation of every copy, arrays (num_copies, ...), without the noise of a perturbed sensor."""
+        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in self.cameras}}
+        if self.obs_type == "pixels_agent_pos":
+            seen["agent_pos"] = self.started().agent_state().cpu().numpy().astype(np.float32)
+        return seen
+
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
+        seen = self.observations(obs)
         # Contiguous: an array with gaps takes four times as long to be sent to another process.
-        pictures = {name: obs["sensor_data"][name]["rgb"][0].contiguous().cpu().numpy() for name in self.cameras}
-        pixels = {name: self._sensed(name, picture) for name, picture in pictures.items()}
-        return {"pixels": pixels} | ({} if self.obs_type == "pixels" else {"agent_pos": self.agent_state()})
+        pixels = {name: self._sensed(name, np.ascontiguousarray(one[0])) for name, one in seen["pixels"].items()}
+        return {name: one[0] for name, one in seen.items() if name != "pixels"} | {"pixels": pixels}
 
     def _sensed(self, camera: str, image: np.ndarray) -> np.ndarray:
         """`image`, (H, W, 3) uint8, as a noisy sensor sees it."""

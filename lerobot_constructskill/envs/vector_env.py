@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.envs.gym_env import NOT_STARTED, ConstructSkillEnv, said
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, said
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError
 
@@ -46,15 +46,13 @@ class NativeVectorEnv(gym.vector.VectorEnv):
             raise InputError(f"${FOLDER} records one environment per simulator only; use vectorization=process.")
         check_unperturbed(kwargs.get("perturb", ""))
         self._single = ConstructSkillEnv(**kwargs)
-        self.num_envs = n_envs
+        self.num_envs = self._single.num_copies = n_envs
         self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
         self.render_mode = ConstructSkillEnv.render_mode
         self.single_observation_space = self._single.observation_space
         self.single_action_space = self._single.action_space
         self.observation_space = batch_space(self.single_observation_space, n_envs)
         self.action_space = batch_space(self.single_action_space, n_envs)
-        self._env = None
-        self._steps = 0
         self._done = np.zeros(n_envs, dtype=bool)
         self._last: tuple | None = None
 
@@ -74,14 +72,10 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
         if len(seeds) != self.num_envs:
             raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
-        if self._env is None:
-            self._env = self._single.make_scene(self.num_envs)
-        # As in `ConstructSkillEnv`: PhysX would keep contacts.
-        obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
-        self._steps = 0
+        obs, info = self._single.begin([int(one) for one in seeds])
         self._done[:] = False
         contract = np.full(self.num_envs, json.dumps(self._single.contract), dtype=object)
-        return self._observations(obs), self._infos(info) | {"contract": contract}
+        return self._single.observations(obs), self._infos(info) | {"contract": contract}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance 1/20 s; `actions` are (n_envs, A) in metres.
@@ -89,14 +83,11 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        env = self._started()
         scaled = np.stack([self._single.maniskill_action(action) for action in actions])
-        obs, reward, terminated, _, info = env.step(scaled)
-        self._steps += 1
-        truncated = np.full(self.num_envs, self._steps >= self._single._max_episode_steps)
-        outcome = reward.cpu().numpy(), terminated.cpu().numpy(), truncated
+        obs, reward, terminated, truncated, info = self._single.advance(scaled)
+        outcome = reward.cpu().numpy(), terminated.cpu().numpy(), np.full(self.num_envs, truncated)
         obs, reward, terminated, truncated, info = _keep(
-            self._last, (self._observations(obs), *outcome, self._infos(info)), self._done
+            self._last, (self._single.observations(obs), *outcome, self._infos(info)), self._done
         )
         self._last = obs, np.zeros_like(reward), terminated, truncated, info
         self._done = terminated | truncated
@@ -108,7 +99,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        return tuple(self._started().render().cpu().numpy())
+        return tuple(self._single.started().render().cpu().numpy())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """The attribute or method `name` of every environment."""
@@ -121,21 +112,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         return self.call(name)
 
     def close_extras(self, **kwargs: Any) -> None:
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-
-    def _started(self) -> gym.Env:
-        if self._env is None:
-            raise RuntimeError(NOT_STARTED)
-        return self._env
-
-    def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
-        cameras = self._single.cameras
-        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in cameras}}
-        if self._single.obs_type == "pixels_agent_pos":
-            seen["agent_pos"] = self._env.agent_state().cpu().numpy().astype(np.float32)
-        return seen
+        self._single.close()
 
     def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
         return {name: value.cpu().numpy() for name, value in said(info).items()}
