@@ -42,7 +42,12 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
         cameras: those that are shown, by their names in `contract.CAMERAS`.
         has_state: `observation.state` is shown too, as in every data set.
     """
-    state = {"state": _describe_state()} if has_state else {}
+    state = {
+        "key": "observation.state",
+        "frame": BASE_FRAME,
+        "meaning": "Position of the end effector, its rotation as axis-angle, and the position of each finger.",
+        "channels": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
+    }
     return {
         "task": task.name,
         "instruction": task.instruction,
@@ -53,7 +58,7 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
             "end_effector_in_panda_hand": [*TCP_IN_HAND],
         },
         "action": _describe_action(task.action_names),
-        **state,
+        **({"state": state} if has_state else {}),
         "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
     }
 
@@ -83,15 +88,6 @@ def _describe_channel(name: str) -> dict[str, Any]:
     unit = "rad" if name in ROTATION else "m"
     reach = {"low": -ACTION_SCALE, "high": ACTION_SCALE}
     return {"name": name, "unit": unit, **reach, "meaning": "Asked for in one step."}
-
-
-def _describe_state() -> dict[str, Any]:
-    return {
-        "key": "observation.state",
-        "frame": BASE_FRAME,
-        "meaning": "Position of the end effector, its rotation as axis-angle, and the position of each finger.",
-        "channels": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
-    }
 
 
 def _describe_camera(camera: Camera) -> dict[str, Any]:

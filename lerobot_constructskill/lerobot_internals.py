@@ -103,17 +103,12 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(owner), name)
     except (AttributeError, ModuleNotFoundError) as error:
-        if isinstance(error, ModuleNotFoundError) and error.name not in _with_parents(owner):
+        if isinstance(error, ModuleNotFoundError) and not f"{owner}.".startswith(f"{error.name}."):
             raise  # a package that LeRobot itself lacks
         raise MachineError(
             f"LeRobot {version('lerobot')} has no {owner}.{name}, which this package needs: install a version that it "
             "was tried with (docs/lerobot.md)."
         ) from None
-
-
-def _with_parents(module: str) -> list[str]:
-    parts = module.split(".")
-    return [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
 
 
 @cache

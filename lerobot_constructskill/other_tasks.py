@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
-    """Yield the name of each package with a row that it offers, as the environment's metadata lists them.
+    """Yield every row that an installed package offers, after the package's name.
 
     A package whose rows cannot be loaded is skipped with a warning, so that it does not stop other tasks.
 
@@ -26,7 +26,10 @@ def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
             rows = _load(point, kind)
         except (Exception, SystemExit) as error:  # whatever the code of another package may raise
             if parent_process() is None:  # workers would repeat it
-                logger.warning("The tasks of the package '%s' are left out: %s", _package(point), _said(point, error))
+                logger.warning(
+                    "The tasks of the package '%s' are left out: its entry point %s = %s fails (%s: %s).",
+                    *(_package(point), point.name, point.value, type(error).__name__, first_line(error)),
+                )
             continue
         yield from ((_package(point), row) for row in rows)
 
@@ -41,7 +44,3 @@ def _load[Row](point: EntryPoint, kind: type[Row]) -> list[Row]:
 
 def _package(point: EntryPoint) -> str:
     return point.dist.name if point.dist else point.module
-
-
-def _said(point: EntryPoint, error: Exception) -> str:
-    return f"its entry point {point.name} = {point.value} fails ({type(error).__name__}: {first_line(error)})."

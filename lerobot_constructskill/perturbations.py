@@ -78,8 +78,7 @@ class Perturbation:
 
     def amount(self, axis: str) -> float:
         """The number of the level at which `axis` is perturbed, in the axis's unit; 0 where it is not."""
-        level = self._level(axis)
-        return AXES[axis].levels[level - 1] if level else 0.0
+        return (0.0, *AXES[axis].levels)[self._level(axis)]
 
     @property
     def pictures(self) -> tuple[float, ...]:

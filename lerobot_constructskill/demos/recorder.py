@@ -92,7 +92,11 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
             successes = sum(outcome.success for outcome in attempts)
             bar.set_postfix(discarded=len(attempts) - successes, refresh=False)
             bar.update(max(0, successes - bar.n))
-            _check_failures(config, len(attempts) - successes)
+            if (failures := len(attempts) - successes) > config.max_failures * config.episodes:
+                raise InputError(
+                    f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
+                    f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
+                )
             if len(running) < min(config.episodes - successes, config.workers):
                 seed = next(seeds)
                 if seed in before:
@@ -104,14 +108,6 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
                 attempts += [future.result() for future in done]
             else:
                 return sorted(attempts, key=lambda outcome: outcome.seed)
-
-
-def _check_failures(config: GenerateConfig, failures: int) -> None:
-    if failures > config.max_failures * config.episodes:
-        raise InputError(
-            f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
-            f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
-        )
 
 
 def check_disk(config: GenerateConfig, root: Path) -> None:

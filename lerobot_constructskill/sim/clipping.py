@@ -1,4 +1,4 @@
-"""Actions that ask for more than the controller gives are clipped and counted; once a process that is logged."""
+"""Clips and counts actions that ask for more than the controller gives, and warns of them once a process."""
 
 import logging
 from typing import ClassVar
@@ -8,7 +8,7 @@ import torch
 from lerobot_constructskill.contract import ACTION_SCALE
 
 LEAST, SHARE = 10, 0.1
-"""So many clipped actions of an episode, and more than this share of those so far, are logged."""
+"""An episode with at least so many clipped actions, and more than this share of all so far, is warned of."""
 
 logger = logging.getLogger(__name__)
 
@@ -20,7 +20,7 @@ class Clipping:
     loses nothing by it, and its controller clips it.
     """
 
-    has_told: ClassVar[bool] = False
+    has_warned: ClassVar[bool] = False
 
     def __init__(self, num_envs: int, device: torch.device):
         self.steps = torch.zeros(num_envs, dtype=torch.int32, device=device)
@@ -35,19 +35,14 @@ class Clipping:
         if not is_beyond.any():
             return action
         self.steps += is_beyond
-        if not Clipping.has_told:
-            self._tell(before + 1)
-        return action.clamp(-1, 1)
-
-    def _tell(self, taken: torch.Tensor) -> None:
         worst = int(self.steps.argmax())
-        clipped, steps = int(self.steps[worst]), int(taken[worst])
-        if clipped < LEAST or clipped <= SHARE * steps:
-            return
-        Clipping.has_told = True
-        logger.warning(
-            "%d of the first %d actions of an episode asked for more than %g m or rad and were clipped. "
-            "--env.type=constructskill takes metres and radians per step, not -1 to 1 (`env.contract` says units and "
-            "ranges); ManiSkill's ids take -1 to 1, where 1 is %g m or rad.",
-            *(clipped, steps, ACTION_SCALE, ACTION_SCALE),
-        )
+        clipped, steps = int(self.steps[worst]), int(before[worst]) + 1
+        if not Clipping.has_warned and clipped >= LEAST and clipped > SHARE * steps:
+            Clipping.has_warned = True
+            logger.warning(
+                "%d of the first %d actions of an episode asked for more than %g m or rad and were clipped. "
+                "--env.type=constructskill takes metres and radians per step, not -1 to 1 (`env.contract` says units "
+                "and ranges); ManiSkill's ids take -1 to 1, where 1 is %g m or rad.",
+                *(clipped, steps, ACTION_SCALE, ACTION_SCALE),
+            )
+        return action.clamp(-1, 1)

@@ -97,8 +97,7 @@ def relative_pose(frame: sapien.Pose, pose: sapien.Pose) -> tuple[Numbers, Numbe
 
 
 def invert(q: Numbers) -> Numbers:
-    w, x, y, z = q
-    return w, -x, -y, -z
+    return q[0], -q[1], -q[2], -q[3]
 
 
 def rotate(q: Numbers, point: Numbers) -> Numbers:

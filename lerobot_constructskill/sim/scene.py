@@ -207,14 +207,11 @@ class PickPlaceEnv(BaseEnv):
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
-        shader = colour_shader() if self._is_colour_enough() else None
+        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
+        is_colour_enough = asked == {"rgb"} and not self.backend.render_device.is_cuda()
+        shader = colour_shader() if is_colour_enough else None
         size = {"width": IMAGE_SIZE, "height": IMAGE_SIZE}
         return CameraConfig(camera.name, fov=camera.fov, shader_config=shader, **size, **view)
-
-    def _is_colour_enough(self) -> bool:
-        """Whether observations are colour pictures alone, rendered on a CPU."""
-        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
-        return asked == {"rgb"} and not self.backend.render_device.is_cuda()
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:

@@ -22,7 +22,7 @@ TASK = "block_to_bin"
 
 @pytest.fixture(autouse=True)
 def nobody_was_told(monkeypatch):
-    monkeypatch.setattr(Clipping, "has_told", False)
+    monkeypatch.setattr(Clipping, "has_warned", False)
 
 
 def of_lerobot(**kwargs):
