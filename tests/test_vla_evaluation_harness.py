@@ -24,7 +24,7 @@ from random_features import config, tiny_weights  # noqa: F401
 
 from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, OBS_TYPES, REWARD_PLACED, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
-from lerobot_constructskill.sim.clipping import LEAST, Clipping
+from lerobot_constructskill.sim.actions import LEAST, Clipping
 
 pytest.importorskip("vla_eval", reason="extra `evaluators`")
 

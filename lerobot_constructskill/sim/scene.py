@@ -3,7 +3,7 @@
 A task derives from `PickPlaceEnv`, loads its asset and, where the layout differs, sets four geometry constants.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import chain
 
@@ -33,9 +33,8 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.sim.actions import HOLDING, Clipping, Hold
 from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
-from lerobot_constructskill.sim.clipping import Clipping
-from lerobot_constructskill.sim.hold import HOLDING, Hold
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.robot import LightPanda, QuickPanda, seen_from
 from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, textured
@@ -258,8 +257,7 @@ class PickPlaceEnv(BaseEnv):
         way = np.linspace(ends[0], ends[1], 5)
         for i, (size, place) in enumerate(self.draws.offcuts(np.vstack([ends, way]), self.spawn_range + 0.18)):
             builder = self.scene.create_actor_builder()
-            builder.add_box_collision(half_size=size / 2)
-            builder.add_box_visual(half_size=size / 2, material=(0.55, 0.38, 0.20))
+            self._add_box(builder, [0, 0, 0], size, (0.55, 0.38, 0.20))
             builder.initial_pose = sapien.Pose(p=place)
             builder.build_static(name=f"offcut_{i}")
 
@@ -273,14 +271,35 @@ class PickPlaceEnv(BaseEnv):
 
         By default a floor and four walls around `bin_interior`.
         """
-        x, y, z = (extent / 2 for extent in self.bin_interior)
-        t = WALL / 2
-        panels = [([0, 0, -z - t], [x + WALL, y + WALL, t])]
-        panels += [([side * (x + t), 0, 0], [t, y + WALL, z]) for side in (-1, 1)]
-        panels += [([0, side * (y + t), 0], [x, t, z]) for side in (-1, 1)]
-        for center, half_size in panels:
-            builder.add_box_collision(sapien.Pose(center), half_size)
-            builder.add_box_visual(sapien.Pose(center), half_size, material=(0.10, 0.22, 0.42))
+        x, y, z = self.bin_interior
+        panels = [([0, 0, -(z + WALL) / 2], [x + 2 * WALL, y + 2 * WALL, WALL])]
+        panels += [([side * (x + WALL) / 2, 0, 0], [WALL, y + 2 * WALL, z]) for side in (-1, 1)]
+        panels += [([0, side * (y + WALL) / 2, 0], [x, WALL, z]) for side in (-1, 1)]
+        for center, size in panels:
+            self._add_box(builder, center, size, (0.10, 0.22, 0.42))
+
+    def _add_box(
+        self,
+        builder: ActorBuilder,
+        center: Sequence[float] | sapien.Pose,
+        size: Sequence[float],
+        look: tuple[float, float, float] | np.ndarray,
+        density: float = 1000.0,
+    ) -> None:
+        """Add a box to an actor, which collides and is seen.
+
+        Args:
+            center: position in the actor's frame, (3,) metres, or a pose in it.
+            size: edges in metres, (3,).
+            look: colour as RGB from 0 to 1, or a texture, (H, W, 3) uint8.
+            density: kg/m3.
+        """
+        pose = center if isinstance(center, sapien.Pose) else sapien.Pose(center)
+        half_size = np.array(size) / 2
+        builder.add_box_collision(pose, half_size, density=density)
+        if self.scene.can_render():
+            material = textured(look) if isinstance(look, np.ndarray) else look
+            builder.add_box_visual(pose, half_size, material=material)
 
     # Gymnasium
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lerobot_constructskill.sim.hold import Hold
+from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.scene import PickPlaceEnv
 
 UPRIGHT = np.radians(3.0)

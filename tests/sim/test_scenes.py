@@ -20,8 +20,8 @@ from lerobot_constructskill.contract import IMAGE_SIZE, JOINTS, LADDER, SIM_STAT
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim import backends, scene
+from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.backends import best_render_backend
-from lerobot_constructskill.sim.hold import Hold
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
 from lerobot_constructskill.sim.tasks.block import BlockToBinEnv
 from lerobot_constructskill.sim.tasks.brick import TOLERANCE

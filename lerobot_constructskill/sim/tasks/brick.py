@@ -6,7 +6,7 @@ from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
 
 from lerobot_constructskill.contract import LADDER, TASKS
-from lerobot_constructskill.sim.hold import Hold
+from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.perturb import check_fits
 from lerobot_constructskill.sim.scene import PickPlaceEnv
 from lerobot_constructskill.sim.strict import StrictPlaceEnv
@@ -46,20 +46,18 @@ class BrickToBinEnv(PickPlaceEnv):
     is_brick = True
 
     def _load_object(self, builder: ActorBuilder) -> None:
-        self._add_brick(builder, sapien.Pose())
+        self._add_brick(builder, 0.0)
 
-    def _add_brick(self, builder: ActorBuilder, pose: sapien.Pose) -> None:
-        x, y, z = half_size = np.array(self.object_size) / 2
-        builder.add_box_collision(pose, half_size, density=CLAY_DENSITY)
+    def _add_brick(self, builder: ActorBuilder, height: float) -> None:
+        x, y, z = np.array(self.object_size) / 2
+        colour, pattern = self.draws.surface("brick", CLAY_RED, 0)
+        clay = mottled(colour, contrast=0.12, size=512, seed=pattern)
+        self._add_box(builder, [0, 0, height], self.object_size, clay, CLAY_DENSITY)
         if self.scene.can_render():
-            colour, pattern = self.draws.surface("brick", CLAY_RED, 0)
-            clay = mottled(colour, contrast=0.12, size=512, seed=pattern)
             # SAPIEN unfolds a box on its texture as a cross of 3 x 4 faces: 2 x 5 holes a face.
             bed = perforated(clay, rows=3 * 2, columns=4 * 5, radius=0.28)
-            builder.add_box_visual(pose, half_size, material=textured(clay))
             for side in (-1, 1):  # a skin on each bed face shows the perforations
-                skin = pose * sapien.Pose([0, side * y, 0])
-                builder.add_box_visual(skin, [x, SKIN, z], material=textured(bed))
+                builder.add_box_visual(sapien.Pose([0, side * y, height]), [x, SKIN, z], material=textured(bed))
 
 
 @register_env(TASKS["brick_to_bin_shifted"].env_id, max_episode_steps=TASKS["brick_to_bin_shifted"].horizon)
@@ -155,4 +153,4 @@ class BrickOnBrickEnv(StrictPlaceEnv, BrickToBinEnv):
         return (self.object_size[0] + 2 * TOLERANCE, self.object_size[1] + 2 * TOLERANCE, 0.04)
 
     def _load_bin(self, builder: ActorBuilder) -> None:
-        self._add_brick(builder, sapien.Pose([0, 0, -(self.bin_interior[2] + self.object_size[2]) / 2]))
+        self._add_brick(builder, -(self.bin_interior[2] + self.object_size[2]) / 2)

@@ -1,13 +1,12 @@
 """Timber joint: the tenon of a post into the mortise of a sill."""
 
 import numpy as np
-import sapien
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
 
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.sim.strict import StrictPlaceEnv
-from lerobot_constructskill.sim.visuals import mottled, textured
+from lerobot_constructskill.sim.visuals import mottled
 
 POST = (0.06, 0.05, 0.07)
 """Of the post above its tenon, in metres."""
@@ -61,7 +60,4 @@ class TenonToMortiseEnv(StrictPlaceEnv):
             self._add_timber(builder, [side * (x + sides) / 2, 0, 0], [sides, y, depth], LARCH)
 
     def _add_timber(self, builder: ActorBuilder, center, size, colour) -> None:
-        pose, half_size = sapien.Pose(center), np.array(size) / 2
-        builder.add_box_collision(pose, half_size, density=SPRUCE_DENSITY)
-        if self.scene.can_render():
-            builder.add_box_visual(pose, half_size, material=textured(mottled(colour, contrast=0.06, seed=2)))
+        self._add_box(builder, center, size, mottled(colour, contrast=0.06, seed=2), SPRUCE_DENSITY)

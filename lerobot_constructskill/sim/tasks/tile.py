@@ -47,9 +47,7 @@ class TileToGridEnv(StrictPlaceEnv):
     def _load_object(self, builder: ActorBuilder) -> None:
         parts = [([SIDE, SIDE, THICKNESS], -HANDLE[2] / 2, WHITE), (HANDLE, THICKNESS / 2, RUBBER)]
         for size, z, colour in parts:
-            half_size, pose = np.array(size) / 2, sapien.Pose([0, 0, z])
-            builder.add_box_collision(pose, half_size, density=MINERAL_FIBRE_DENSITY)
-            builder.add_box_visual(pose, half_size, material=colour)
+            self._add_box(builder, [0, 0, z], size, colour, MINERAL_FIBRE_DENSITY)
 
     def _load_bin(self, builder: ActorBuilder) -> None:
         """Four T-bars around the opening, on four posts; the origin is the middle of the opening."""
@@ -62,6 +60,4 @@ class TileToGridEnv(StrictPlaceEnv):
                 ([inner + BAR / 2, inner + BAR / 2, floor - GRID_HEIGHT / 2], [BAR, BAR, GRID_HEIGHT]),
             ]
             for center, size in boxes:
-                pose, half_size = frame * sapien.Pose(center), np.array(size) / 2
-                builder.add_box_collision(pose, half_size)
-                builder.add_box_visual(pose, half_size, material=STEEL)
+                self._add_box(builder, frame * sapien.Pose(center), size, STEEL)
