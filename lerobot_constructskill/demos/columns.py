@@ -10,7 +10,7 @@ from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, OBS_TYPES, SIM_
 from lerobot_constructskill.files import Json
 
 ACTORS = EXPERT, LEARNER = "expert", "learner"
-"""Whose action was executed in a frame; the demonstrations' noise is the expert's."""
+"""Whose action was executed in a frame; an expert's action with noise is the expert's."""
 
 SIDECAR = "meta/constructskill.json"
 """Where a data set keeps how it was made, relative to its root."""
@@ -24,7 +24,7 @@ MADE = Json("the record of how a data set was made", _Made)
 """Of the file `SIDECAR`."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
-"""Columns that data sets of earlier versions lack; such sets also have no channel names in `sim.*` and `next.*`."""
+"""Columns that older data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
 
 
 def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
@@ -45,7 +45,7 @@ def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any
 
 
 def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
-    """The columns of `demonstration_features`, and those that say who was at the wheel."""
+    """The columns of `demonstration_features`, and those that say who acted."""
     return demonstration_features(task, obs_type) | {
         "dagger.round": _column("int64", "round"),
         "dagger.actor": _column("string", "actor"),
