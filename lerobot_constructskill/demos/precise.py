@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
-from lerobot_constructskill.demos.advice import Memoryless
 from lerobot_constructskill.demos.expert import Phase, Progress
 from lerobot_constructskill.demos.pick_place import GRAVITY, PickPlaceExpert
 from lerobot_constructskill.demos.state import OPENED, PrivilegedState
@@ -158,7 +157,7 @@ class TurningExpert(PreciseExpert):
         return 0.0
 
     def _is_there(self, state: PrivilegedState) -> bool:
-        return Memoryless._is_there(self, state)  # its bin is wide: the object need not stand in the middle
+        return PickPlaceExpert._is_there(self, state)  # its bin is wide: the object need not stand in the middle
 
     def _is_turned(self, state: PrivilegedState, phase: Phase = Phase.PREGRASP) -> bool:
         return abs(self._yaw_error(state, self._beginning(phase, state))) < YAW_STEP
