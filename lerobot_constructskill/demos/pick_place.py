@@ -75,21 +75,27 @@ class PickPlaceExpert:
             return progress.steps >= self.config.grasp_dwell
         if progress.phase is Phase.RELEASE:
             return False
-        return bool(np.linalg.norm(self._target(state, progress) - state.tcp) < self.config.threshold)
+        return bool(np.linalg.norm(self._error(state, progress)) < self.config.threshold)
 
     def _translation(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
         if progress.phase in (Phase.GRASP, Phase.RELEASE):
             return np.zeros(3)
-        error = self._waypoint(state, progress) - state.tcp
-        if progress.phase not in (Phase.LIFT, Phase.CARRY):
-            return self._toward(error, self.config.max_step)
-        return self._toward(error, self.config.load_max_step) + self._weight_compensation(state)
+        if progress.phase in (Phase.LIFT, Phase.CARRY):
+            moved = self._toward(self._error(state, progress), self.config.load_max_step)
+            return moved + self._weight_compensation(state)
+        return self._toward(self._waypoint(state, progress) - state.tcp, self.config.max_step)
 
     def _weight_compensation(self, state: PrivilegedState) -> np.ndarray:
         return np.array([0, 0, self.config.compliance * (GRAVITY * state.object_mass[0])])
 
     def _toward(self, error: np.ndarray, longest: float) -> np.ndarray:
         return np.clip(self.config.gain * error, -longest, longest)
+
+    def _error(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+        """What lies between the state and the end of the phase, (3,) metres."""
+        if progress.phase is Phase.CARRY:
+            return self._carry_error(state)
+        return self._target(state, progress) - state.tcp
 
     def _target(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
         """Where the end effector should go in this phase, (3,) metres."""
@@ -100,8 +106,6 @@ class PickPlaceExpert:
                 return self._grasp_point(state)
             case Phase.LIFT:
                 return _within_reach(progress.anchor + [0, 0, self.config.lift_height])
-            case Phase.CARRY:
-                return self._release_point(state)
         raise RuntimeError(f"{progress.phase} has no target.")
 
     def _grasp_point(self, state: PrivilegedState) -> np.ndarray:
@@ -122,10 +126,11 @@ class PickPlaceExpert:
         """Height that the hand reaches over `point`, in metres."""
         return float(_within_reach(np.array([*point[:2], np.inf]))[2])
 
-    def _release_point(self, state: PrivilegedState) -> np.ndarray:
-        """Above the bin's centre, the object's underside `release_clearance` above the rim."""
+    def _carry_error(self, state: PrivilegedState) -> np.ndarray:
+        """From the hand to the point over the bin's centre where the object is `release_clearance` above the rim."""
         below_tcp = state.object_size[2] - self.config.finger_depth
-        return np.array([*state.bin_position[:2], state.rim + self.config.release_clearance + below_tcp])
+        above = state.rim + self.config.release_clearance + below_tcp
+        return np.array([*state.bin_position[:2], above]) - state.tcp
 
     # Advice: the phase of a state and its action, without progress, as a learner's states need it
 
@@ -156,7 +161,7 @@ class PickPlaceExpert:
 
         Far from the bin it goes as high as it was lifted, and comes down on the way, as a demonstration's does.
         """
-        error = self._release_error(state)
+        error = self._carry_error(state)
         near = (state.bin_interior + state.object_size)[:2] / 2 + RISEN
         height = max(0.0, (abs(error[:2]) - near).max())
         # Far out the arm may not reach as high as the release, and has to come nearer first.
@@ -231,11 +236,7 @@ class PickPlaceExpert:
         away = abs(state.object_pose[:2] - state.bin_position[:2])
         is_inside = (away < (state.bin_interior - state.object_size)[:2] / 2).all()
         is_inserted = is_inside and state.underside < float(state.rim)
-        return bool(is_inserted or np.linalg.norm(self._release_error(state)) < self.config.threshold)
-
-    def _release_error(self, state: PrivilegedState) -> np.ndarray:
-        """From the hand to where CARRY ends, (3,) metres."""
-        return self._release_point(state) - state.tcp
+        return bool(is_inserted or np.linalg.norm(self._carry_error(state)) < self.config.threshold)
 
     def _is_off_centre(self, state: PrivilegedState) -> bool:
         return bool(np.linalg.norm((self._grasp_point(state) - state.tcp)[:2]) > OFF_CENTRE)

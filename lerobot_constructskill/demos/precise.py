@@ -58,8 +58,6 @@ class PreciseExpert(PickPlaceExpert):
     """Closes the loop on the object's pose from CARRY on."""
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
-        if progress.phase is Phase.CARRY:
-            return bool(np.linalg.norm(self._carry_error(state)) < self.config.threshold)
         is_centred = (abs(self._grasp_point(state) - state.tcp) < CENTRED).all()
         return super()._is_over(state, progress) and bool(is_centred or progress.phase is not Phase.DESCEND)
 
@@ -69,13 +67,7 @@ class PreciseExpert(PickPlaceExpert):
         return after.phase is Phase.RELEASE and risen > self.config.pregrasp_clearance
 
     def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
-        match progress.phase:
-            case Phase.CARRY:
-                moved = self._toward(self._carry_error(state), self.config.load_max_step)
-                return np.array([*moved + self._weight_compensation(state), GRIPPER_CLOSED])
-            case Phase.RELEASE:
-                return self._release(state)
-        return super()._action(state, progress)
+        return self._release(state) if progress.phase is Phase.RELEASE else super()._action(state, progress)
 
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
         """From the object's centre to the point where its underside is `release_clearance` above the rim, (3,)."""
@@ -119,9 +111,6 @@ class PreciseExpert(PickPlaceExpert):
             return _is_over_opening(state, error)
         return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
 
-    def _release_error(self, state: PrivilegedState) -> np.ndarray:
-        return self._carry_error(state)
-
     def _is_off_centre(self, state: PrivilegedState) -> bool:
         error = abs(self._grasp_point(state) - state.tcp)
         return bool((error > 2 * CENTRED + ALIGNED).any())
@@ -133,22 +122,23 @@ class TurningExpert(PreciseExpert):
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
         turns = progress.phase in (Phase.PREGRASP, Phase.CARRY)
-        is_turned = abs(self._yaw_error(state, progress)) < YAW_TOLERANCE
+        is_turned = abs(self._yaw_error(state, progress.phase)) < YAW_TOLERANCE
         return super()._is_over(state, progress) and (is_turned or not turns)
 
     def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
         *translation, gripper = super()._action(state, progress)
-        turn = np.clip(self._yaw_error(state, progress), -YAW_STEP, YAW_STEP)
+        turn = np.clip(self._yaw_error(state, progress.phase), -YAW_STEP, YAW_STEP)
         return np.array([*translation, turn, gripper])
 
-    def _yaw_error(self, state: PrivilegedState, progress: Progress) -> float:
+    def _yaw_error(self, state: PrivilegedState, phase: Phase) -> float:
+        """How far the jaws have to turn in this phase, in radians."""
         yaw = yaw_of(state.object_pose)
-        match progress.phase:
+        match phase:
             case Phase.PREGRASP | Phase.DESCEND:
                 jaws = np.arctan2(-state.jaw_axis[0], state.jaw_axis[1])
                 return _half_turn(yaw - jaws)
             case Phase.LIFT | Phase.CARRY:
-                return _half_turn(-yaw) * (progress.phase is Phase.CARRY)
+                return _half_turn(-yaw) * (phase is Phase.CARRY)
         return 0.0
 
     # Advice
@@ -160,7 +150,7 @@ class TurningExpert(PreciseExpert):
         return PickPlaceExpert._is_there(self, state)  # its bin is wide: the object need not stand in the middle
 
     def _is_turned(self, state: PrivilegedState, phase: Phase = Phase.PREGRASP) -> bool:
-        return abs(self._yaw_error(state, self._beginning(phase, state))) < YAW_STEP
+        return abs(self._yaw_error(state, phase)) < YAW_STEP
 
     def _is_at_receptacle(self, state: PrivilegedState) -> bool:
         is_turned = self._is_turned(state, Phase.CARRY)
