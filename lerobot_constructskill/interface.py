@@ -57,23 +57,19 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
             "base_in_world": [*ROBOT_BASE],
             "end_effector_in_panda_hand": [*TCP_IN_HAND],
         },
-        "action": _describe_action(task.action_names),
+        "action": {
+            "key": "action",
+            "frame": BASE_FRAME,
+            "meaning": (
+                f"What the controller is asked for in one step of 1/{FPS} s, from where the hand is. The hand moves "
+                f"about {MOVED_SHARE} of it in the step, and stops when nothing is asked for. What is out of range is "
+                "clipped. Rotations turn about the axes of the frame, right-handed."
+            ),
+            "moved_share": MOVED_SHARE,
+            "channels": [_describe_channel(name) for name in task.action_names],
+        },
         **({"state": state} if has_state else {}),
         "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
-    }
-
-
-def _describe_action(names: tuple[str, ...]) -> dict[str, Any]:
-    return {
-        "key": "action",
-        "frame": BASE_FRAME,
-        "meaning": (
-            f"What the controller is asked for in one step of 1/{FPS} s, from where the hand is. The hand moves about "
-            f"{MOVED_SHARE} of it in the step, and stops when nothing is asked for. What is out of range is clipped. "
-            "Rotations turn about the axes of the frame, right-handed."
-        ),
-        "moved_share": MOVED_SHARE,
-        "channels": [_describe_channel(name) for name in names],
     }
 
 

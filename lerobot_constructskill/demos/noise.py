@@ -52,8 +52,13 @@ class NoiseConfig:
         check(self, "noise.")
         if self.model in FITTED and self.covariance is None:
             raise InputError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
-        if self.covariance is not None:
-            _check_covariance(self.covariance)
+        if self.covariance is None:
+            return
+        matrix = np.array(self.covariance) if len({len(row) for row in self.covariance}) == 1 else np.empty(0)
+        if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
+            raise InputError(f"A noise covariance must be a symmetric 3 x 3 matrix in m2, not {self.covariance}.")
+        if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
+            raise InputError(f"The noise covariance {self.covariance} has a negative variance.")
 
     @cached_property
     def root(self) -> np.ndarray:
@@ -65,14 +70,6 @@ class NoiseConfig:
             return np.sqrt(np.trace(covariance) / 3) * np.eye(3)
         values, vectors = np.linalg.eigh(covariance)
         return vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
-
-
-def _check_covariance(covariance: list[list[float]]) -> None:
-    matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
-    if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
-        raise InputError(f"A noise covariance must be a symmetric 3 x 3 matrix in m2, not {covariance}.")
-    if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
-        raise InputError(f"The noise covariance {covariance} has a negative variance.")
 
 
 def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray:

@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType, perturbed_task
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
@@ -54,7 +54,13 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     def __post_init__(self):
         with heard_by_lerobot():
-            rows = self._check()
+            check(self)
+            if self.max_parallel_tasks != 1:
+                raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+            if self.vectorization == "native":
+                check_unperturbed(self.perturb)
+            tasks = [row.name for suite in select_tasks(self.task).values() for row in suite]
+            rows = [perturbed_task(name, self.perturb, self.perturb_seed)[0] for name in tasks]
         image = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))
         cameras = {CAMERAS[name].key: image for name in OBS_TYPES[self.obs_type]}
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),)), **cameras}
@@ -62,16 +68,6 @@ class ConstructSkillEnvConfig(EnvConfig):
         if self.obs_type == "pixels_agent_pos":
             self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
             self.features_map["agent_pos"] = "observation.state"
-
-    def _check(self) -> list[Task]:
-        """Return the tasks."""
-        check(self)
-        if self.max_parallel_tasks != 1:
-            raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
-        if self.vectorization == "native":
-            check_unperturbed(self.perturb)
-        names = [row.name for suite in select_tasks(self.task).values() for row in suite]
-        return [perturbed_task(name, self.perturb, self.perturb_seed)[0] for name in names]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:

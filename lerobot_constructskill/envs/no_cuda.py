@@ -1,7 +1,4 @@
-"""Imported first by a fork server: torch, which LeRobot's imports ask for a GPU, does not initialise CUDA there.
-
-torch then asks the driver's NVML instead.
-"""
+"""Imported first by a fork server: torch then asks NVML whether there is a GPU, and does not initialise CUDA."""
 
 import os
 

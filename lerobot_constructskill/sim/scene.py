@@ -142,10 +142,9 @@ class PickPlaceEnv(BaseEnv):
         **kwargs,
     ):
         self.draws = Draws(perturbation or Perturbation())
-        if self.draws.perturbation.amount("size"):
-            if not self.is_brick:
-                raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
-            self.object_size = self.draws.brick(self.object_size)
+        if self.draws.perturbation.amount("size") and not self.is_brick:
+            raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
+        self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
         elif render_backend == "gpu" and best_render_backend() != "gpu":
