@@ -27,10 +27,14 @@ JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
 """Columns that older data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
 
 
+VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
+"""The column of a camera."""
+
+
 def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
     """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen as `obs_type`."""
     return {
-        **{CAMERAS[name].key: _video() for name in OBS_TYPES[obs_type]},
+        **{CAMERAS[name].key: dict(VIDEO) for name in OBS_TYPES[obs_type]},
         "observation.state": _column("float32", *STATE_NAMES),
         "action": _column("float32", *task.action_names),
         "dart.executed_action": _column("float32", *task.action_names),
@@ -60,14 +64,6 @@ def as_before_joints(features: dict[str, dict[str, Any]]) -> dict[str, dict[str,
         name: feature if name.startswith(named) else feature | {"names": None}
         for name, feature in features.items()
         if name not in JOINT_COLUMNS
-    }
-
-
-def _video() -> dict[str, Any]:
-    return {
-        "dtype": "video",
-        "shape": (IMAGE_SIZE, IMAGE_SIZE, 3),
-        "names": ["height", "width", "channels"],
     }
 
 

@@ -40,7 +40,6 @@ class Progress:
 
 Gain = Annotated[float, Range(above=0, most=100)]
 Step = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
-Compliance = Annotated[float, Range(0, 1, unit="m/N")]
 Height = Annotated[float, Range(-1, 1, unit="m")]
 
 
@@ -71,7 +70,7 @@ class ExpertConfig:
     gain: Gain = 1.0
     max_step: Step = 0.012
     load_max_step: Step = 0.035
-    compliance: Compliance = 0.001
+    compliance: Annotated[float, Range(0, 1, unit="m/N")] = 0.001
     threshold: Step = 0.02
     align_tolerance: Step = 0.006
     grasp_dwell: Steps = 10

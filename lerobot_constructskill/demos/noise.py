@@ -16,7 +16,6 @@ FITTED = ("isotropic", "dart")
 
 Sigma = Annotated[float, Range(0, 1, unit="m")]
 PhaseName = Annotated[str, Among(tuple(Phase))]
-Clip = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ class NoiseConfig:
     sigma: Sigma = 0.01
     covariance: list[list[float]] | None = None
     fitted_on: dict[str, str] | None = None
-    clip: Clip = 0.08
+    clip: Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")] = 0.08
     phases: list[PhaseName] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
     release_sigma: Sigma = 0.0
 

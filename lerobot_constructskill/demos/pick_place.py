@@ -138,7 +138,9 @@ class PickPlaceExpert:
         if state.is_held:
             action, phase, hopeless = *self._carry_on(state), False
         elif self._is_there(state):
-            action, phase, hopeless = self._let_go(state), Phase.RELEASE, False
+            # The hand moves as RELEASE says once the fingers are open.
+            action, phase, hopeless = self._act_in(Phase.RELEASE, state) * state.is_open, Phase.RELEASE, False
+            action[-1] = GRIPPER_OPEN
         elif hopeless := not self._can_take(state):
             action, phase = self._wait(state), Phase.PREGRASP
         else:
@@ -181,20 +183,10 @@ class PickPlaceExpert:
             at_grasp = self._is_over(state, self._beginning(Phase.DESCEND, state))
             phase = Phase.GRASP if at_grasp else Phase.DESCEND
             return self._act_in(phase, state), phase
-        rising = self._share_to_clear(state, grasp)
+        obstacle = state.obstacle if state.crosses_bin(grasp) else state.top
+        rising = float(np.clip((obstacle + 2 * RISEN - state.tcp[2]) / RISEN, 0, 1))
         over = self._act_in(Phase.PREGRASP, state)
         return rising * self._straight_up(state) + (1 - rising) * over, Phase.PREGRASP
-
-    def _share_to_clear(self, state: PrivilegedState, target: np.ndarray) -> float:
-        """How much an empty hand has to rise before it moves sideways, 0 to 1."""
-        obstacle = state.obstacle if state.crosses_bin(target) else state.top
-        return float(np.clip((obstacle + 2 * RISEN - state.tcp[2]) / RISEN, 0, 1))
-
-    def _let_go(self, state: PrivilegedState) -> np.ndarray:
-        """RELEASE's own action once the fingers are open."""
-        action = self._act_in(Phase.RELEASE, state) * state.is_open
-        action[-1] = GRIPPER_OPEN
-        return action
 
     def _straight_up(self, state: PrivilegedState) -> np.ndarray:
         action = 0 * self._act_in(Phase.PREGRASP, state)

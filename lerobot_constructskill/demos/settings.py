@@ -18,8 +18,6 @@ from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed", "advice")
 
-Share = Annotated[float, Range(0, 10_000)]
-
 FRAME_PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
 
@@ -61,7 +59,7 @@ class GenerateConfig:
     episodes: Count = 80
     obs_type: Annotated[str, Among(tuple(OBS_TYPES))] = "pixels"
     max_steps: Steps = 1000
-    max_failures: Share = 1.0
+    max_failures: Annotated[float, Range(0, 10_000)] = 1.0
     seed_start: Seed = DEMO_SEED_START
     light_robot: bool | None = None
     labels: Annotated[str, Among(LABELS)] = "clean"

@@ -71,6 +71,7 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `ConstructSkillEnv`."""
         names = ("task", "obs_type", "episode_length", "light_robot", "render_backend", "perturb", "perturb_seed")
         return {name: getattr(self, name) for name in names}
 

@@ -30,7 +30,6 @@ from lerobot_constructskill.perturbations import Perturbation
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
-RenderBackend = Annotated[str, Among((*SEEING, "none"))]
 
 
 def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Perturbation]:
@@ -88,7 +87,7 @@ class ConstructSkillEnv(gym.Env):
         obs_type: ObsType = "pixels",
         episode_length: Steps | None = None,
         light_robot: bool | None = None,
-        render_backend: RenderBackend = "auto",
+        render_backend: Annotated[str, Among((*SEEING, "none"))] = "auto",
         perturb: str = "",
         perturb_seed: Seed = 0,
         cameras: tuple[str, ...] | None = None,

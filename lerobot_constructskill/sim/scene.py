@@ -160,8 +160,7 @@ class PickPlaceEnv(BaseEnv):
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot
-        if robot_uids is None:
-            robot_uids = LightPanda.uid if self.light_robot else QuickPanda.uid
+        robot = LightPanda if self.light_robot else QuickPanda
         if steps_on_gpu(kwargs.get("sim_backend", "auto"), kwargs.get("num_envs", 1)):
             enable_gpu_physics(in_software)
         try:
@@ -169,7 +168,7 @@ class PickPlaceEnv(BaseEnv):
                 keep_software_renderer()
             super().__init__(
                 *args,
-                robot_uids=robot_uids,
+                robot_uids=robot_uids or robot.uid,
                 control_mode=control_mode,
                 render_backend=render_backend,
                 **kwargs,
@@ -302,13 +301,8 @@ class PickPlaceEnv(BaseEnv):
 
     # Gymnasium
 
-    @outside_autocast
-    def reset(self, *args, **kwargs):
-        return super().reset(*args, **kwargs)
-
-    @outside_autocast
-    def step(self, action):
-        return super().step(action)
+    reset = outside_autocast(BaseEnv.reset)
+    step = outside_autocast(BaseEnv.step)
 
     # Initial state
 
