@@ -12,7 +12,6 @@ from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
 MODELS = ("fixed", "isotropic", "dart")
-FITTED = ("isotropic", "dart")
 
 Sigma = Annotated[float, Range(0, 1, unit="m")]
 PhaseName = Annotated[str, Among(tuple(Phase))]
@@ -49,7 +48,7 @@ class NoiseConfig:
 
     def __post_init__(self):
         check(self, "noise.")
-        if self.model in FITTED and self.covariance is None:
+        if self.model != "fixed" and self.covariance is None:
             raise InputError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
         if self.covariance is None:
             return

@@ -32,7 +32,7 @@ IK_ITERATIONS = 100
 
 
 class QuickPoseController(PDEEPoseController):
-    """The arm: the joints that take the tool from where it is to where the action, (1, 6), moves it."""
+    """The arm: its joints go where the action, (1, 6), moves the tool, or stay where there is no solution."""
 
     def set_action(self, action: torch.Tensor) -> None:
         if self.scene.gpu_sim_enabled:
@@ -41,10 +41,6 @@ class QuickPoseController(PDEEPoseController):
         moved, turned = _displacement(self._preprocess_action(action))
         p, q = relative_pose(self.root_link._objs[0].entity_pose, self.ee_link._objs[0].entity_pose)
         target = sapien.Pose([a + b for a, b in zip(p, moved, strict=True)], multiply(turned, q))
-        _drive(self.joints, self._solve(target))
-
-    def _solve(self, target: sapien.Pose) -> np.ndarray:
-        """The controlled joints at `target`, or as they are where there is no solution."""
         qpos, kinematics = self.articulation._objs[0].qpos, self.kinematics
         solution, success, _ = kinematics.pmodel.compute_inverse_kinematics(
             kinematics.end_link_idx,
@@ -53,7 +49,8 @@ class QuickPoseController(PDEEPoseController):
             active_qmask=kinematics.qmask,
             max_iterations=IK_ITERATIONS,
         )
-        return solution[kinematics.pmodel_controlled_joint_indices] if success else qpos[self.active_joint_indices]
+        solved = solution[kinematics.pmodel_controlled_joint_indices]
+        _drive(self.joints, solved if success else qpos[self.active_joint_indices])
 
 
 class QuickMimicController(PDJointPosMimicController):
