@@ -75,11 +75,11 @@ SIM_STATE = {
 """Privileged state, name to the names of its numbers: SI units, world frame."""
 
 DEMO_SEED_START, DEMO_SEED_STOP = 1_000_000, 2**30
-"""Between them lie the seeds of data sets. LeRobot's evaluations start at the training seed or at 1000, the board's at
-5000, and its re-runs have all from the second on."""
+"""First seed of data sets, and the one after their last. LeRobot's evaluations start at the training seed or at 1000,
+the board's at 5000, and its re-runs have all from the second number on."""
 
 HELD_OUT_EVERY = 8
-"""One demonstration of so many is held out of training, the last of each group."""
+"""Size of the groups of demonstrations of which the last one is held out of training."""
 
 
 def held_out(n_episodes: int, every: int = HELD_OUT_EVERY) -> list[int]:
@@ -150,7 +150,7 @@ FIELDS = {
     "expert": "it is module:class",
     "action_names": f"they are {', '.join(TRANSLATION)}, some of {', '.join(ROTATION)}, and {GRIPPER} last",
 }
-"""What fields of a task must be."""
+"""The rule of each checked field of a task, for messages."""
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def get_task(name: str) -> Task:
 
 
 LOOSE = "constructskill"
-"""The suite under which results of tasks that were named one by one are kept."""
+"""Name under which the results of tasks that were chosen one by one are kept."""
 
 
 def select_tasks(names: str) -> dict[str, list[Task]]:

@@ -13,7 +13,7 @@ ACTORS = EXPERT, LEARNER = "expert", "learner"
 """Whose action was executed in a frame; an expert's action with noise is the expert's."""
 
 SIDECAR = "meta/constructskill.json"
-"""Where a data set keeps how it was made, relative to its root."""
+"""The file in which a data set records how it was made, relative to its root."""
 
 
 class _Made(TypedDict):
@@ -21,7 +21,7 @@ class _Made(TypedDict):
 
 
 MADE = Json("the record of how a data set was made", _Made)
-"""Of the file `SIDECAR`."""
+"""Reads the file `SIDECAR`."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
 """Columns that older data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
@@ -58,7 +58,7 @@ def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
 
 
 def as_before_joints(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The same columns as they were before the joints were recorded and every channel had a name."""
+    """The columns of data sets that are older than the recording of joints and the names of all channels."""
     named = ("observation.", "action", "dart.")
     return {
         name: feature if name.startswith(named) else feature | {"names": None}

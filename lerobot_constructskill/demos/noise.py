@@ -1,4 +1,4 @@
-"""Noise on the executed action (Laskey et al. 2017): Gaussian, of a covariance that is fixed or was fitted."""
+"""Gaussian noise on the executed action (Laskey et al. 2017), with a fixed or a fitted covariance."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -60,7 +60,7 @@ class NoiseConfig:
 
     @cached_property
     def root(self) -> np.ndarray:
-        """Symmetric square root of the covariance that is drawn from, (3, 3) in metres."""
+        """Symmetric square root of the noise's covariance, (3, 3) in metres."""
         if self.model == "fixed":
             return self.sigma * np.eye(3)
         covariance = np.array(self.covariance)

@@ -1,4 +1,4 @@
-"""What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
+"""The settings of `constructskill-generate`, and which of them decide the bytes of frames."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -76,12 +76,19 @@ class GenerateConfig:
 
     @property
     def starts(self) -> range:
-        """Seeds of all attempts that it may take."""
+        """Seeds of all attempts that the generation may make."""
         return range(self.seed_start, self.seed_start + self.episodes + int(self.max_failures * self.episodes))
 
 
 def check_apart(starts: Mapping[str, range]) -> None:
-    """Raise InputError where two of some uses, each with the seeds of its starts, would have one start."""
+    """Refuse overlapping seeds.
+
+    Args:
+        starts: each use, such as "evaluation", and the seeds of its initial states.
+
+    Raises:
+        InputError: two uses share a seed.
+    """
     for (one, these), (other, those) in combinations(starts.items(), 2):
         if max(these.start, those.start) < min(these.stop, those.stop):
             raise InputError(
@@ -96,9 +103,9 @@ def generator_facts(config: GenerateConfig) -> dict[str, Any]:
 
 
 def frames_digest(config: GenerateConfig) -> str:
-    """Digest of all that a frame's bytes depend on, so that shards of two kinds never meet in one data set.
+    """Digest of everything that the bytes of frames depend on, so that no data set mixes shards of two kinds.
 
-    What rendered a shard is known when it is there: `merge` refuses a mixture.
+    The renderer is left out, because it is known only once a shard exists; `merge` refuses a mixture of renderers.
     """
     others = ("repo_id", "episodes", "max_failures", "seed_start")
     facts = {name: value for name, value in generator_facts(config).items() if name not in others}
@@ -106,12 +113,12 @@ def frames_digest(config: GenerateConfig) -> str:
 
 
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What a data set depends on beside its settings: the encoder's options and the columns."""
+    """The encoder's options and the columns, on which a data set depends beside its settings."""
     columns = demonstration_features(get_task(config.task), config.obs_type)
     return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)}
 
 
 def frame_versions(task: str) -> dict[str, str]:
-    """What makes the frames of a task: packages, our rooms, and the source of another package's scene and expert."""
+    """Versions that decide frames: packages, our rooms, and the source of another package's scene and expert."""
     row = get_task(task)
     return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert, __name__)

@@ -1,4 +1,4 @@
-"""The process that simulators' workers are forked from: what it has imported, no worker imports again."""
+"""Starts the process that simulators' workers are forked from, so that no worker repeats its imports."""
 
 from collections.abc import Sequence
 from multiprocessing import forkserver

@@ -237,7 +237,7 @@ class ConstructSkillEnv(gym.Env):
         return self._env
 
     def begin(self, seed: int | list[int]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Reset the ManiSkill environment; observation and info are as ManiSkill gives them, of all copies."""
+        """Reset the ManiSkill environment; return its observation and info, of all copies."""
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
         result = self._ensure_env().reset(seed=seed, options={"reconfigure": bool(self._steps)})
         self._steps = 0
@@ -250,7 +250,7 @@ class ConstructSkillEnv(gym.Env):
         return obs, reward, terminated, self._steps >= self._max_episode_steps, info
 
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:
-        """ManiSkill's normalised `pd_ee_delta_pose` action, (7,), for one of ours; the scene clips it to [-1, 1]."""
+        """Convert an action, (A,), to ManiSkill's `pd_ee_delta_pose`, (7,); the scene clips it to [-1, 1]."""
         action = np.asarray(action, dtype=np.float32)
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():
@@ -281,21 +281,21 @@ class ConstructSkillEnv(gym.Env):
         return np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
-        return {name: value[0].item() for name, value in said(info).items()}
+        return {name: value[0].item() for name, value in public_info(info).items()}
 
 
-def said(info: dict[str, Any]) -> dict[str, Any]:
-    """What users are told of ManiSkill's info, tensors (num_envs,): booleans, and the number of clipped steps."""
+def public_info(info: dict[str, Any]) -> dict[str, Any]:
+    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans, and the number of clipped steps."""
     booleans = {name: value for name, value in info.items() if name.startswith("is_")}
     return {"is_success": info["success"], **booleans, "clipped_steps": info["clipped_steps"]}
 
 
 @functools.cache
 def _spare_imports() -> None:
-    """In a worker process, keep what there is by now from the garbage collector.
+    """In a worker process, exempt all present objects from garbage collection.
 
-    ManiSkill has it look at every object whenever a scene ends, and a million imported ones took most of a reset. Any
-    other process is its user's, whose objects have to stay collectable.
+    ManiSkill collects garbage whenever a scene ends, and the million objects of imported modules took most of a
+    reset. Other processes belong to the user, whose objects have to stay collectable.
     """
     if multiprocessing.parent_process() is not None:
         gc.collect()
@@ -303,7 +303,7 @@ def _spare_imports() -> None:
 
 
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
-    """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
+    """Resolve `light_robot` and `render_backend` for this machine; without a simulator they stay as they are."""
     try:
         from lerobot_constructskill.sim.backends import best_render_backend
     except ModuleNotFoundError:

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, said
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, public_info
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError
 
@@ -115,11 +115,11 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         self._single.close()
 
     def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
-        return {name: value.cpu().numpy() for name, value in said(info).items()}
+        return {name: value.cpu().numpy() for name, value in public_info(info).items()}
 
 
 def _keep(old: Any, new: Any, frozen: np.ndarray) -> Any:
-    """`new` with the rows of `old` where `frozen`, through tuples and dicts of arrays."""
+    """Replace the rows of `new` where `frozen` by those of `old`, in tuples and dicts of arrays."""
     if not frozen.any():
         return new
     if isinstance(new, tuple):

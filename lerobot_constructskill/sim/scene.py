@@ -327,7 +327,7 @@ class PickPlaceEnv(BaseEnv):
                 memory[env_idx] = 0
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
-        """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
+        """Joint positions of the rest keyframe, with noise where the pose is perturbed, (9,) or (len(env_idx), 9)."""
         rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")
         if not amount:
             return rest
@@ -429,7 +429,7 @@ class PickPlaceEnv(BaseEnv):
 
     @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
-        """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
+        """The state that experts read, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
         joints = self.agent.robot.get_qpos()
         constants = {
             "object_size": self.object_size,
