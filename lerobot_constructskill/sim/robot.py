@@ -7,6 +7,7 @@ controllers are ManiSkill's own.
 """
 
 from collections.abc import Iterable
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -147,9 +148,8 @@ class LightPanda(QuickPanda):
 
         Its SRDF, which lists the links whose contact is ignored, stands beside it: SAPIEN looks for it there.
         """
-        source = Path(Panda.urdf_path)
-        urdf = source.read_text(encoding="utf-8")
-        meshes = "franka_description/meshes"
-        urdf = urdf.replace(f"{meshes}/visual", str(LIGHT_MESHES)).replace(meshes, str(source.parent / meshes))
+        source, meshes = Path(Panda.urdf_path), "franka_description/meshes"
+        urdf = source.read_text(encoding="utf-8").replace(f"{meshes}/visual", escape(str(LIGHT_MESHES)))
+        urdf = urdf.replace(meshes, escape(str(source.parent / meshes)))
         srdf = source.with_suffix(".srdf").read_text(encoding="utf-8")
         return str(written_once("panda_light", {"panda.urdf": urdf, "panda.srdf": srdf}) / "panda.urdf")
