@@ -18,15 +18,12 @@ def axes(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def pose(camera: Camera) -> np.ndarray:
-    """From points in the camera's axes to points in the world, or in the frame of its link: (4, 4), metres."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack(axes(camera), axis=1)
-    matrix[:3, 3] = camera.eye
-    return matrix
+    """Transform from the camera's axes to the world, or to the frame of the link that carries it: (4, 4), metres."""
+    return np.vstack([np.stack([*axes(camera), camera.eye], axis=1), [0.0, 0.0, 0.0, 1.0]])
 
 
 def intrinsics(camera: Camera) -> np.ndarray:
-    """From points in the camera's axes to pixels: (3, 3), square pixels, the origin at the picture's upper left."""
+    """Projection from the camera's axes to square pixels, (3, 3); their origin is the picture's upper left corner."""
     middle = IMAGE_SIZE / 2
     focal = middle / tan(camera.fov / 2)
     return np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])

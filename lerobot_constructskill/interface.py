@@ -42,7 +42,12 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
         cameras: those that are shown, by their names in `contract.CAMERAS`.
         has_state: `observation.state` is shown too, as in every data set.
     """
-    state = {"state": _describe_state()} if has_state else {}
+    state = {
+        "key": "observation.state",
+        "frame": BASE_FRAME,
+        "meaning": "Position of the end effector, its rotation as axis-angle, and the position of each finger.",
+        "channels": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
+    }
     return {
         "task": task.name,
         "instruction": task.instruction,
@@ -52,23 +57,19 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
             "base_in_world": [*ROBOT_BASE],
             "end_effector_in_panda_hand": [*TCP_IN_HAND],
         },
-        "action": _describe_action(task.action_names),
-        **state,
+        "action": {
+            "key": "action",
+            "frame": BASE_FRAME,
+            "meaning": (
+                f"What the controller is asked for in one step of 1/{FPS} s, from where the hand is. The hand moves "
+                f"about {MOVED_SHARE} of it in the step, and stops when nothing is asked for. What is out of range is "
+                "clipped. Rotations turn about the axes of the frame, right-handed."
+            ),
+            "moved_share": MOVED_SHARE,
+            "channels": [_describe_channel(name) for name in task.action_names],
+        },
+        **({"state": state} if has_state else {}),
         "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
-    }
-
-
-def _describe_action(names: tuple[str, ...]) -> dict[str, Any]:
-    return {
-        "key": "action",
-        "frame": BASE_FRAME,
-        "meaning": (
-            f"What the controller is asked for in one step of 1/{FPS} s, from where the hand is. The hand moves about "
-            f"{MOVED_SHARE} of it in the step, and stops when nothing is asked for. What is out of range is clipped. "
-            "Rotations turn about the axes of the frame, right-handed."
-        ),
-        "moved_share": MOVED_SHARE,
-        "channels": [_describe_channel(name) for name in names],
     }
 
 
@@ -83,15 +84,6 @@ def _describe_channel(name: str) -> dict[str, Any]:
     unit = "rad" if name in ROTATION else "m"
     reach = {"low": -ACTION_SCALE, "high": ACTION_SCALE}
     return {"name": name, "unit": unit, **reach, "meaning": "Asked for in one step."}
-
-
-def _describe_state() -> dict[str, Any]:
-    return {
-        "key": "observation.state",
-        "frame": BASE_FRAME,
-        "meaning": "Position of the end effector, its rotation as axis-angle, and the position of each finger.",
-        "channels": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
-    }
 
 
 def _describe_camera(camera: Camera) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What this package uses of LeRobot that LeRobot does not export. Any release may move it, so it is named here alone.
+"""The names of LeRobot that this package uses though LeRobot does not export them; a release may move any of them.
 
 `from lerobot_constructskill.lerobot_internals import write_video` imports LeRobot's module then and no sooner. All
 else comes from LeRobot's packages by the names in their `__all__`: `from lerobot.datasets import LeRobotDataset`.
@@ -38,13 +38,13 @@ NAMES = {
     # Of draccus, by which LeRobot reads its configurations: the parser of flags.
     "ArgumentParser": "draccus.argparsing",
 }
-"""The modules that hold them."""
+"""Name to the module that holds it."""
 
 LAST_CHECKPOINT = Path("checkpoints", "last", "pretrained_model")
 """Where `lerobot-train` leaves its newest checkpoint in its output folder."""
 
 TRAIN_CONFIG = "train_config.json"
-"""What a checkpoint of `lerobot-train` was trained with, beside its weights."""
+"""The file beside a checkpoint's weights that says what it was trained with."""
 
 
 class _TrainingSet(TypedDict, total=False):
@@ -88,12 +88,12 @@ class _Info(TypedDict):
 
 
 INFO = "meta/info.json"
-"""What makes a folder a data set of LeRobot's."""
+"""The file that makes a folder a LeRobot data set."""
 
 DATA_SET = Json("a LeRobot data set's description", _Info)
 TRAINED = Json("what lerobot-train writes", _Trained)
 EVALUATED = Json("what lerobot-eval writes", _Evaluated)
-"""What is read of LeRobot's own files."""
+"""Readers of LeRobot's own files."""
 
 
 def __getattr__(name: str) -> Any:
@@ -103,17 +103,12 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(owner), name)
     except (AttributeError, ModuleNotFoundError) as error:
-        if isinstance(error, ModuleNotFoundError) and error.name not in _with_parents(owner):
+        if isinstance(error, ModuleNotFoundError) and not f"{owner}.".startswith(f"{error.name}."):
             raise  # a package that LeRobot itself lacks
         raise MachineError(
             f"LeRobot {version('lerobot')} has no {owner}.{name}, which this package needs: install a version that it "
             "was tried with (docs/lerobot.md)."
         ) from None
-
-
-def _with_parents(module: str) -> list[str]:
-    parts = module.split(".")
-    return [".".join(parts[:n]) for n in range(1, len(parts) + 1)]
 
 
 @cache
@@ -124,7 +119,7 @@ def load_plugins() -> None:
 
 @contextmanager
 def patched(name: str, ours: Callable) -> Iterator[None]:
-    """In its block LeRobot calls `ours` where it would call one of `NAMES`."""
+    """Within the block LeRobot calls `ours` in place of the function `name`, one of `NAMES`."""
     theirs, owner = __getattr__(name), import_module(NAMES[name])
     setattr(owner, name, ours)
     try:

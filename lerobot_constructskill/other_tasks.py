@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 def offered[Row](kind: type[Row]) -> Iterator[tuple[str, Row]]:
-    """Yield the name of each package with a row that it offers, as the environment's metadata lists them.
+    """Yield every row that an installed package offers, after the package's name.
 
     A package whose rows cannot be loaded is skipped with a warning, so that it does not stop other tasks.
 

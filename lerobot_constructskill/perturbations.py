@@ -77,18 +77,17 @@ class Perturbation:
         return int(dict(self._pairs()).get(axis, 0))
 
     def amount(self, axis: str) -> float:
-        """The number of the level at which `axis` is perturbed, in the axis's unit; 0 where it is not."""
-        level = self._level(axis)
-        return AXES[axis].levels[level - 1] if level else 0.0
+        """How far `axis` is perturbed, in the axis's unit; 0 where it is not."""
+        return (0.0, *AXES[axis].levels)[self._level(axis)]
 
     @property
     def pictures(self) -> tuple[float, ...]:
-        """What is changed in all pictures and in nothing else."""
+        """Amounts of the axes that change all pictures and nothing else."""
         return tuple(self.amount(axis) for axis in PICTURES)
 
     @property
     def label(self) -> str:
-        """How results are marked: empty without a perturbation, else such as `+camera=2+light=1+seed=0`.
+        """The mark of results: empty without a perturbation, else such as `+camera=2+light=1+seed=0`.
 
         Two spellings of one perturbation have one label.
         """

@@ -34,7 +34,7 @@ from lerobot_constructskill.study.rows import read_rows
 RESULTS = Path(__file__).parents[1] / "results"
 PACKAGE = Path(lerobot_constructskill.__file__).parent
 MODULES = [found.name for found in pkgutil.walk_packages([str(PACKAGE)], f"{lerobot_constructskill.__name__}.")]
-OWN = {"sim/shader.py", "sim/visuals.py", "presets.py", "dataset/card.py", "artifacts/processor.py"}
+OWN = {"sim/robot.py", "sim/visuals.py", "presets.py", "dataset/card.py", "artifacts/processor.py"}
 """Files that read what is installed or of the system alone."""
 
 

@@ -24,7 +24,7 @@ from random_features import config, tiny_weights  # noqa: F401
 
 from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, OBS_TYPES, REWARD_PLACED, get_task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
-from lerobot_constructskill.sim.clipping import LEAST, Clipping
+from lerobot_constructskill.sim.actions import LEAST, Clipping
 
 pytest.importorskip("vla_eval", reason="extra `evaluators`")
 
@@ -104,7 +104,7 @@ def test_the_expert_succeeds_through_the_harness(benchmark_class, monkeypatch):
 
 @pytest.mark.sim
 def test_a_model_that_sends_normalised_actions_is_told_so(benchmark_class, monkeypatch, caplog):
-    monkeypatch.setattr(Clipping, "has_told", False)
+    monkeypatch.setattr(Clipping, "has_warned", False)
     benchmark = benchmark_class(tasks="brick_to_bin")
     (task,) = benchmark.get_tasks()
     asyncio.run(benchmark.start_episode(task))

@@ -38,7 +38,7 @@ INTERFACE = {
 }
 """Title of a page to the public modules and classes on it."""
 
-BASES = {"PickPlaceEnv": "lerobot_constructskill.sim.scene", "PreciseEnv": "lerobot_constructskill.sim.precise"}
+BASES = {"PickPlaceEnv": "lerobot_constructskill.sim.scene", "StrictPlaceEnv": "lerobot_constructskill.sim.strict"}
 """Scenes whose success conditions the docstrings of tasks refer to, to their modules."""
 
 

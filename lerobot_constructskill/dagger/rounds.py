@@ -14,7 +14,7 @@ from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Machine, Node
 from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.dagger.wheel import Drive, Episode, drive_all
+from lerobot_constructskill.dagger.driving import Drive, Episode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.merge import aggregate

@@ -10,10 +10,10 @@ from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, OBS_TYPES, SIM_
 from lerobot_constructskill.files import Json
 
 ACTORS = EXPERT, LEARNER = "expert", "learner"
-"""Whose action was executed in a frame; the demonstrations' noise is the expert's."""
+"""Whose action was executed in a frame; an expert's action with noise is the expert's."""
 
 SIDECAR = "meta/constructskill.json"
-"""Where a data set keeps how it was made, relative to its root."""
+"""The file in which a data set records how it was made, relative to its root."""
 
 
 class _Made(TypedDict):
@@ -21,16 +21,20 @@ class _Made(TypedDict):
 
 
 MADE = Json("the record of how a data set was made", _Made)
-"""Of the file `SIDECAR`."""
+"""Reads the file `SIDECAR`."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
-"""Columns that data sets of earlier versions lack; such sets also have no channel names in `sim.*` and `next.*`."""
+"""Columns that older data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
+
+
+VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
+"""The column of a camera."""
 
 
 def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
     """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen as `obs_type`."""
     return {
-        **{CAMERAS[name].key: _video() for name in OBS_TYPES[obs_type]},
+        **{CAMERAS[name].key: dict(VIDEO) for name in OBS_TYPES[obs_type]},
         "observation.state": _column("float32", *STATE_NAMES),
         "action": _column("float32", *task.action_names),
         "dart.executed_action": _column("float32", *task.action_names),
@@ -45,7 +49,7 @@ def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any
 
 
 def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
-    """The columns of `demonstration_features`, and those that say who was at the wheel."""
+    """The columns of `demonstration_features`, and those that say who acted."""
     return demonstration_features(task, obs_type) | {
         "dagger.round": _column("int64", "round"),
         "dagger.actor": _column("string", "actor"),
@@ -54,20 +58,12 @@ def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
 
 
 def as_before_joints(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The same columns as they were before the joints were recorded and every channel had a name."""
+    """The columns of data sets that are older than the recording of joints and the names of all channels."""
     named = ("observation.", "action", "dart.")
     return {
         name: feature if name.startswith(named) else feature | {"names": None}
         for name, feature in features.items()
         if name not in JOINT_COLUMNS
-    }
-
-
-def _video() -> dict[str, Any]:
-    return {
-        "dtype": "video",
-        "shape": (IMAGE_SIZE, IMAGE_SIZE, 3),
-        "names": ["height", "width", "channels"],
     }
 
 

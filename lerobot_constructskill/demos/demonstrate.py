@@ -1,4 +1,4 @@
-"""One demonstration: an expert drives an environment through noise, and every frame is kept."""
+"""Runs one demonstration: an expert acts in an environment under noise, and every frame is kept."""
 
 from collections.abc import Callable
 from typing import Any
@@ -55,7 +55,7 @@ def demonstrate(
 
 
 def seen(pixels: dict[str, np.ndarray], agent_state: np.ndarray, sim: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The columns of what is there before a step."""
+    """The columns that are known before a step: pictures, proprioception and simulator state."""
     return {
         **{CAMERAS[name].key: image for name, image in pixels.items()},
         "observation.state": agent_state,
@@ -64,7 +64,7 @@ def seen(pixels: dict[str, np.ndarray], agent_state: np.ndarray, sim: dict[str, 
 
 
 def decided(label: np.ndarray, clean: np.ndarray, executed: np.ndarray, phase: Phase, seed: int) -> dict[str, Any]:
-    """The columns of what the expert says and what is executed."""
+    """The columns of the step's label, its executed action, noise, phase and seed."""
     return {
         "action": label,
         "dart.executed_action": executed,
@@ -75,7 +75,7 @@ def decided(label: np.ndarray, clean: np.ndarray, executed: np.ndarray, phase: P
 
 
 def came_of_it(reward: float, success: bool, is_over: bool) -> dict[str, Any]:
-    """The columns of what is there after a step."""
+    """The columns of the step's reward and outcome."""
     return {
         "next.reward": np.array([reward], dtype=np.float32),
         "next.success": np.array([success]),

@@ -1,6 +1,6 @@
-"""What a scripted expert is: a pure function of privileged state and of its own progress. It never holds the env."""
+"""Scripted experts: pure functions of the privileged state and of their own progress, without the environment."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from importlib import import_module
 from typing import Annotated, Protocol
@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_constructskill.bounds import Range, Steps, check
 from lerobot_constructskill.contract import ACTION_SCALE, Task
+from lerobot_constructskill.demos.state import PrivilegedState
 
 
 class Phase(StrEnum):
@@ -20,45 +21,6 @@ class Phase(StrEnum):
     LIFT = "LIFT"
     CARRY = "CARRY"
     RELEASE = "RELEASE"
-
-
-@dataclass(frozen=True)
-class PrivilegedState:
-    """The simulator's state as `contract.SIM_STATE` names it: float arrays, SI units, world frame.
-
-    Data sets made before the joints were recorded have none of them.
-    """
-
-    tcp_pose: np.ndarray
-    fingers: np.ndarray
-    object_pose: np.ndarray
-    object_size: np.ndarray
-    object_mass: np.ndarray
-    bin_position: np.ndarray
-    bin_interior: np.ndarray
-    joint_positions: np.ndarray | None = None
-    joint_velocities: np.ndarray | None = None
-
-    @property
-    def tcp(self) -> np.ndarray:
-        """Position of the point between the finger tips, (3,)."""
-        return self.tcp_pose[:3]
-
-    @property
-    def jaw_axis(self) -> np.ndarray:
-        """Unit vector along which the fingers close, (3,): the y axis of the end effector."""
-        w, x, y, z = self.tcp_pose[3:]
-        return np.array([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)])
-
-    @property
-    def rim(self) -> float:
-        """Height of the receptacle's rim."""
-        return self.bin_position[2] + self.bin_interior[2] / 2
-
-    @property
-    def floor(self) -> float:
-        """Height of the receptacle's floor."""
-        return self.bin_position[2] - self.bin_interior[2] / 2
 
 
 @dataclass(frozen=True)
@@ -75,13 +37,9 @@ class Progress:
     steps: int
     anchor: np.ndarray
 
-    def step(self) -> "Progress":
-        return replace(self, steps=self.steps + 1)
-
 
 Gain = Annotated[float, Range(above=0, most=100)]
 Step = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
-Compliance = Annotated[float, Range(0, 1, unit="m/N")]
 Height = Annotated[float, Range(-1, 1, unit="m")]
 
 
@@ -112,7 +70,7 @@ class ExpertConfig:
     gain: Gain = 1.0
     max_step: Step = 0.012
     load_max_step: Step = 0.035
-    compliance: Compliance = 0.001
+    compliance: Annotated[float, Range(0, 1, unit="m/N")] = 0.001
     threshold: Step = 0.02
     align_tolerance: Step = 0.006
     grasp_dwell: Steps = 10
@@ -128,7 +86,7 @@ class ExpertConfig:
 
 @dataclass(frozen=True)
 class Advice:
-    """What an expert would do in a state, however it came about.
+    """What an expert would do in a state, whatever led to the state.
 
     Args:
         action: (len(task.action_names),) float32, in metres with the gripper last.
@@ -143,23 +101,24 @@ class Advice:
 
 
 class Expert(Protocol):
-    """A scripted controller.
+    """A scripted controller, made from an `ExpertConfig`."""
 
-    `start` gives the progress before the first action. `act` gives the action, (len(task.action_names),) in
-    metres with the gripper last, the phase it belongs to, and the progress after it, or None once the
-    demonstration is over.
+    def start(self, state: PrivilegedState) -> Progress:
+        """The progress before the first action."""
 
-    `advise` gives the action from the state alone, also in states that the expert never reaches by itself: where
-    somebody else is at the wheel, there is no progress to go by.
-    """
+    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]:
+        """One step of a demonstration.
 
-    def __init__(self, config: ExpertConfig): ...
+        Returns:
+            The action, (len(task.action_names),) float32 in metres with the gripper last, its phase, and the progress
+            after it, or None once the demonstration is over.
+        """
 
-    def start(self, state: PrivilegedState) -> Progress: ...
+    def advise(self, state: PrivilegedState) -> Advice:
+        """The action from the state alone, also in states that the expert never reaches by itself.
 
-    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]: ...
-
-    def advise(self, state: PrivilegedState) -> Advice: ...
+        When a learner acts, the expert has no progress of its own.
+        """
 
 
 def make_expert(task: Task, config: ExpertConfig) -> Expert:

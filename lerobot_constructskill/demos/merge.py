@@ -1,4 +1,4 @@
-"""Shards into one LeRobotDataset by LeRobot's own aggregation, in the order of their seeds, the same bytes always."""
+"""Merges shards into one LeRobotDataset by LeRobot's own aggregation, in the order of seeds, with the same bytes."""
 
 import json
 import tempfile
@@ -59,7 +59,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
 
 
 def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:
-    """LeRobot's aggregation, in groups of groups: it writes the growing files anew for every set that it appends."""
+    """Aggregate data sets in groups of groups: LeRobot rewrites the growing files for every set that it appends."""
     from lerobot.datasets import aggregate_datasets
 
     from lerobot_constructskill.lerobot_internals import patched
@@ -75,9 +75,10 @@ def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> N
 
 
 def kept_of_episodes(folder: Path) -> "Dataset":
-    """What LeRobot keeps of a data set's episodes, read without the statistics that it would read and drop.
+    """The episodes of a data set without their statistics, which LeRobot would read and drop.
 
-    They are nine of ten columns, and `datasets` takes time with the square of the number. Nothing goes to its cache.
+    Statistics are nine of ten columns, and the time that `datasets` takes grows with the square of their number.
+    Nothing is written to the cache of `datasets`.
     """
     from datasets import Dataset
     from pyarrow.dataset import dataset
@@ -88,9 +89,10 @@ def kept_of_episodes(folder: Path) -> "Dataset":
 
 
 def write_statistics(folder: Path) -> None:
-    """Put the statistics of all frames in place of aggregated ones, and their names in order.
+    """Replace the aggregated statistics by those of all frames, with columns in the order of their names.
 
-    LeRobot averages the quantiles of episodes, which are not the data set's, and lists columns in the order of a set.
+    LeRobot averages the quantiles of episodes, which differ from those of the data set, and its order of columns is
+    that of a Python set.
     """
     from lerobot.datasets import write_stats
 

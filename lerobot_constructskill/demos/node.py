@@ -31,8 +31,7 @@ class Demonstrations(Node):
 
     def facts(self) -> dict[str, Any]:
         facts = generator_facts(self.config)
-        for name in ("repo_id", "max_failures"):
-            del facts[name]
+        del facts["repo_id"], facts["max_failures"]
         light_robot, backend = resolve_rendering(self.config.light_robot)
         return facts | frame_facts(self.config) | {"light_robot": light_robot, "render_backend": backend}
 

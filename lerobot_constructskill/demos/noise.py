@@ -1,6 +1,7 @@
-"""Noise on the executed action (Laskey et al. 2017): Gaussian, of a covariance that is fixed or was fitted."""
+"""Gaussian noise on the executed action (Laskey et al. 2017), with a fixed or a fitted covariance."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -11,11 +12,9 @@ from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.errors import InputError
 
 MODELS = ("fixed", "isotropic", "dart")
-FITTED = ("isotropic", "dart")
 
 Sigma = Annotated[float, Range(0, 1, unit="m")]
 PhaseName = Annotated[str, Among(tuple(Phase))]
-Clip = Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")]
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,25 @@ class NoiseConfig:
     sigma: Sigma = 0.01
     covariance: list[list[float]] | None = None
     fitted_on: dict[str, str] | None = None
-    clip: Clip = 0.08
+    clip: Annotated[float, Range(above=0, most=ACTION_SCALE, unit="m")] = 0.08
     phases: list[PhaseName] = field(default_factory=lambda: ["PREGRASP", "DESCEND", "LIFT", "CARRY"])
     release_sigma: Sigma = 0.0
 
     def __post_init__(self):
         check(self, "noise.")
-        if self.model in FITTED and self.covariance is None:
+        if self.model != "fixed" and self.covariance is None:
             raise InputError(f"Noise model '{self.model}' needs a covariance; constructskill-fit-noise writes one.")
-        if self.covariance is not None:
-            _check_covariance(self.covariance)
+        if self.covariance is None:
+            return
+        matrix = np.array(self.covariance) if len({len(row) for row in self.covariance}) == 1 else np.empty(0)
+        if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
+            raise InputError(f"A noise covariance must be a symmetric 3 x 3 matrix in m2, not {self.covariance}.")
+        if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
+            raise InputError(f"The noise covariance {self.covariance} has a negative variance.")
 
-    @property
+    @cached_property
     def root(self) -> np.ndarray:
-        """Symmetric square root of the covariance that is drawn from, (3, 3) in metres."""
+        """Symmetric square root of the noise's covariance, (3, 3) in metres."""
         if self.model == "fixed":
             return self.sigma * np.eye(3)
         covariance = np.array(self.covariance)
@@ -64,14 +68,6 @@ class NoiseConfig:
             return np.sqrt(np.trace(covariance) / 3) * np.eye(3)
         values, vectors = np.linalg.eigh(covariance)
         return vectors * np.sqrt(np.maximum(values, 0)) @ vectors.T
-
-
-def _check_covariance(covariance: list[list[float]]) -> None:
-    matrix = np.array(covariance) if len({len(row) for row in covariance}) == 1 else np.empty(0)
-    if matrix.shape != (3, 3) or not np.allclose(matrix, matrix.T, atol=1e-12):
-        raise InputError(f"A noise covariance must be a symmetric 3 x 3 matrix in m2, not {covariance}.")
-    if np.linalg.eigvalsh(matrix).min() < -1e-9 * np.trace(matrix):
-        raise InputError(f"The noise covariance {covariance} has a negative variance.")
 
 
 def execute(action: np.ndarray, phase: Phase, config: NoiseConfig, rng: np.random.Generator) -> np.ndarray:

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
-from lerobot_constructskill.demos.advice import Memoryless
-from lerobot_constructskill.demos.expert import Phase, PrivilegedState, Progress
-from lerobot_constructskill.demos.pick_place import GRAVITY, GRIPPER, PickPlaceExpert
-from lerobot_constructskill.demos.stance import OPENED, Stance
+from lerobot_constructskill.demos.expert import Phase, Progress
+from lerobot_constructskill.demos.pick_place import GRAVITY, PickPlaceExpert
+from lerobot_constructskill.demos.state import OPENED, PrivilegedState
 
 RELEASE_GAP = 0.003
 """Height in metres over the floor of the receptacle from which an object may drop."""
@@ -59,27 +58,16 @@ class PreciseExpert(PickPlaceExpert):
     """Closes the loop on the object's pose from CARRY on."""
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
-        if progress.phase is Phase.CARRY:
-            return bool(np.linalg.norm(self._carry_error(state)) < self.config.threshold)
-        is_near = super()._is_over(state, progress)
-        if progress.phase is Phase.DESCEND:
-            error = abs(self._grasp_point(state) - state.tcp)
-            return is_near and (error < CENTRED).all()
-        return is_near
+        is_centred = (abs(self._grasp_point(state) - state.tcp) < CENTRED).all()
+        return super()._is_over(state, progress) and bool(is_centred or progress.phase is not Phase.DESCEND)
 
     def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
-        """Once the hand has risen well clear of the object."""
-        risen = state.tcp[2] - _top(state)
+        """Whether the hand has risen well clear of the object."""
+        risen = state.tcp[2] - (state.object_pose[2] + state.object_size[2] / 2)
         return after.phase is Phase.RELEASE and risen > self.config.pregrasp_clearance
 
     def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
-        match progress.phase:
-            case Phase.CARRY:
-                moved = self._toward(self._carry_error(state), self.config.load_max_step)
-                return np.array([*moved + self._weight_compensation(state), GRIPPER_CLOSED])
-            case Phase.RELEASE:
-                return self._release(state)
-        return np.array([*self._translation(state, progress), GRIPPER[progress.phase]])
+        return self._release(state) if progress.phase is Phase.RELEASE else super()._action(state, progress)
 
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
         """From the object's centre to the point where its underside is `release_clearance` above the rim, (3,)."""
@@ -87,7 +75,9 @@ class PreciseExpert(PickPlaceExpert):
         return np.array([*state.bin_position[:2], above]) - state.object_pose[:3]
 
     def _release(self, state: PrivilegedState) -> np.ndarray:
-        gap = _lowest(state, self.config.finger_depth) - _underside(state)
+        # Down to the floor, or to where the fingers would meet the rim.
+        lowest = max(state.floor, state.rim + TIP_CLEARANCE - (state.object_size[2] - self.config.finger_depth))
+        gap = lowest - _underside(state)
         if min(state.fingers) > OPENED:
             return np.array([0, 0, self.config.max_step, GRIPPER_OPEN])
         if gap > -RELEASE_GAP:
@@ -96,7 +86,9 @@ class PreciseExpert(PickPlaceExpert):
         haste = self._haste(state, error)
         error[2] = haste * (gap - RELEASE_GAP) + (1 - haste) * error[2]
         step = np.clip(ALIGNING_GAIN * error, -LOWERING_STEP, LOWERING_STEP)
-        return np.array([*step + self._weight_compensation(state) + _outward(state), GRIPPER_CLOSED])
+        radius = (state.tcp - ROBOT_BASE) * [1, 1, 0]
+        outward = DRAWN_IN * GRAVITY * state.object_mass[0] * radius / np.linalg.norm(radius)
+        return np.array([*step + self._weight_compensation(state) + outward, GRIPPER_CLOSED])
 
     def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
         """How fast to lower, 0 to 1: not at all outside a funnel over the opening, and gradually from its wall on."""
@@ -108,23 +100,19 @@ class PreciseExpert(PickPlaceExpert):
 
     # Advice
 
-    def _is_there(self, stance: Stance) -> bool:
-        state = stance.state
+    def _is_there(self, state: PrivilegedState) -> bool:
         is_over = _is_over_opening(state, self._carry_error(state))
-        return bool(stance.stands and is_over and stance.underside < state.floor + SEATED)
+        return bool(state.stands and is_over and state.underside < state.floor + SEATED)
 
-    def _is_at_receptacle(self, stance: Stance) -> bool:
+    def _is_at_receptacle(self, state: PrivilegedState) -> bool:
         """RELEASE aligns above the opening; an object that has come down beside it rises again."""
-        state, error = stance.state, self._carry_error(stance.state)
-        if stance.underside < state.rim:
+        error = self._carry_error(state)
+        if state.underside < state.rim:
             return _is_over_opening(state, error)
         return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
 
-    def _release_error(self, stance: Stance) -> np.ndarray:
-        return self._carry_error(stance.state)
-
-    def _is_off_centre(self, stance: Stance) -> bool:
-        error = abs(self._grasp_point(stance.state) - stance.state.tcp)
+    def _is_off_centre(self, state: PrivilegedState) -> bool:
+        error = abs(self._grasp_point(state) - state.tcp)
         return bool((error > 2 * CENTRED + ALIGNED).any())
 
 
@@ -134,38 +122,39 @@ class TurningExpert(PreciseExpert):
 
     def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
         turns = progress.phase in (Phase.PREGRASP, Phase.CARRY)
-        is_turned = abs(self._yaw_error(state, progress)) < YAW_TOLERANCE
+        is_turned = abs(self._yaw_error(state, progress.phase)) < YAW_TOLERANCE
         return super()._is_over(state, progress) and (is_turned or not turns)
 
     def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
         *translation, gripper = super()._action(state, progress)
-        turn = np.clip(self._yaw_error(state, progress), -YAW_STEP, YAW_STEP)
+        turn = np.clip(self._yaw_error(state, progress.phase), -YAW_STEP, YAW_STEP)
         return np.array([*translation, turn, gripper])
 
-    def _yaw_error(self, state: PrivilegedState, progress: Progress) -> float:
+    def _yaw_error(self, state: PrivilegedState, phase: Phase) -> float:
+        """How far the jaws have to turn in this phase, in radians."""
         yaw = yaw_of(state.object_pose)
-        match progress.phase:
+        match phase:
             case Phase.PREGRASP | Phase.DESCEND:
                 jaws = np.arctan2(-state.jaw_axis[0], state.jaw_axis[1])
                 return _half_turn(yaw - jaws)
             case Phase.LIFT | Phase.CARRY:
-                return _half_turn(-yaw) * (progress.phase is Phase.CARRY)
+                return _half_turn(-yaw) * (phase is Phase.CARRY)
         return 0.0
 
     # Advice
 
-    def _skew(self, stance: Stance) -> float:
+    def _skew(self, state: PrivilegedState) -> float:
         return 0.0
 
-    def _is_there(self, stance: Stance) -> bool:
-        return Memoryless._is_there(self, stance)
+    def _is_there(self, state: PrivilegedState) -> bool:
+        return PickPlaceExpert._is_there(self, state)  # its bin is wide: the object need not stand in the middle
 
-    def _is_turned(self, stance: Stance) -> bool:
-        return abs(self._yaw_error(stance.state, self._beginning(Phase.PREGRASP, stance.state))) < YAW_STEP
+    def _is_turned(self, state: PrivilegedState, phase: Phase = Phase.PREGRASP) -> bool:
+        return abs(self._yaw_error(state, phase)) < YAW_STEP
 
-    def _is_at_receptacle(self, stance: Stance) -> bool:
-        is_turned = abs(self._yaw_error(stance.state, self._beginning(Phase.CARRY, stance.state))) < YAW_STEP
-        return super()._is_at_receptacle(stance) and (is_turned or stance.underside < stance.rim)
+    def _is_at_receptacle(self, state: PrivilegedState) -> bool:
+        is_turned = self._is_turned(state, Phase.CARRY)
+        return super()._is_at_receptacle(state) and (is_turned or state.underside < float(state.rim))
 
 
 def yaw_of(pose: np.ndarray) -> np.ndarray:
@@ -179,25 +168,11 @@ def _half_turn(angle: float) -> float:
     return (angle + np.pi / 2) % np.pi - np.pi / 2
 
 
-def _outward(state: PrivilegedState) -> np.ndarray:
-    """Translation that holds a loaded arm out, (3,) metres."""
-    radius = (state.tcp - ROBOT_BASE) * [1, 1, 0]
-    return DRAWN_IN * GRAVITY * state.object_mass[0] * radius / np.linalg.norm(radius)
-
-
-def _up(state: PrivilegedState) -> np.ndarray:
-    """World height of the ends of the object's three axes, (3,); (0, 0, 1) where it is level."""
-    w, x, y, z = state.object_pose[3:]
-    return np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-
-
 def _underside(state: PrivilegedState) -> float:
-    """Height of the object's lowest corner, in metres."""
-    return state.object_pose[2] - abs(_up(state)) @ state.object_size / 2
-
-
-def _top(state: PrivilegedState) -> float:
-    return state.object_pose[2] + state.object_size[2] / 2
+    """Height of the object's lowest corner in metres, in float32 as recorded demonstrations have it."""
+    w, x, y, z = state.object_pose[3:]
+    ends = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+    return state.object_pose[2] - abs(ends) @ state.object_size / 2
 
 
 def _play(state: PrivilegedState) -> np.ndarray:
@@ -207,8 +182,3 @@ def _play(state: PrivilegedState) -> np.ndarray:
 
 def _is_over_opening(state: PrivilegedState, error: np.ndarray) -> bool:
     return bool((abs(error[:2]) < np.maximum(_play(state), COARSEST)).all())
-
-
-def _lowest(state: PrivilegedState, finger_depth: float) -> float:
-    """Lowest height of the object's underside, in metres: on the floor, or where the fingers would meet the rim."""
-    return max(state.floor, state.rim + TIP_CLEARANCE - (state.object_size[2] - finger_depth))

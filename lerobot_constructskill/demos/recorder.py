@@ -7,7 +7,6 @@ shards that it finished.
 import logging
 import shutil
 from concurrent.futures import FIRST_COMPLETED, wait
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP, OBS_TYPES
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
-from lerobot_constructskill.demos.shards import Attempt, attempt, finished
+from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, attempt, whole
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
 from lerobot_constructskill.progress import Progress, quiet
@@ -28,21 +27,14 @@ logger = logging.getLogger(__name__)
 SHARDS = "shards"
 
 
-@dataclass(frozen=True)
-class Summary:
-    """What a generation did: where the data set is, its sizes, and the seeds that were discarded."""
-
-    root: Path
-    episodes: int
-    frames: int
-    discarded_seeds: list[int]
-
-
-def record(config: GenerateConfig) -> Summary:
+def record(config: GenerateConfig) -> tuple[Path, list[Attempt]]:
     """Write the data set of `config`; it is the same however many workers there are and however often it was killed.
 
     What a killed or failed run finished stays in `<root>.partial` until the data set is whole. Shards of other
     settings are not looked at.
+
+    Returns:
+        The data set's root, and all attempts in the order of their seeds, the failed and discarded ones among them.
 
     Raises:
         FileExistsError: the root exists already, or another process is writing it.
@@ -55,8 +47,7 @@ def record(config: GenerateConfig) -> Summary:
     check_disk(config, root)
     with staged(root, keep=SHARDS) as folder:
         attempts = write(config, folder)
-    lengths = [outcome.frames for outcome in attempts if outcome.success]
-    return Summary(root, len(lengths), sum(lengths), [outcome.seed for outcome in attempts if not outcome.success])
+    return root, attempts
 
 
 def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
@@ -80,19 +71,24 @@ def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
 def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
     """Run attempts, or find their shards, until enough have succeeded; return them in the order of their seeds.
 
-    Never more run than are still needed, so none is run in vain: which seeds are taken depends on no worker.
+    No more attempts run at once than are still needed, so which seeds are taken does not depend on the workers.
     """
-    before, attempts, running = finished(shards), [], set()
+    before = {outcome.seed: outcome for outcome in whole(shards, OUTCOME, ATTEMPT.read)}
+    attempts, running = [], set()
     seeds = count(config.seed_start)
     found = min(config.episodes, sum(outcome.success for outcome in before.values()))
-    # Smoothed: the start of the simulators, in the first demonstration's time, is forgotten by and by.
+    # Smoothed, so that the start of the simulators, part of the first demonstration's time, counts less and less.
     bar = Progress(total=config.episodes, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
     with bar, open_pool(config.executor, config.workers) as submit:
         while True:
             successes = sum(outcome.success for outcome in attempts)
             bar.set_postfix(discarded=len(attempts) - successes, refresh=False)
             bar.update(max(0, successes - bar.n))
-            _check_failures(config, len(attempts) - successes)
+            if (failures := len(attempts) - successes) > config.max_failures * config.episodes:
+                raise InputError(
+                    f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
+                    f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
+                )
             if len(running) < min(config.episodes - successes, config.workers):
                 seed = next(seeds)
                 if seed in before:
@@ -106,18 +102,10 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
                 return sorted(attempts, key=lambda outcome: outcome.seed)
 
 
-def _check_failures(config: GenerateConfig, failures: int) -> None:
-    if failures > config.max_failures * config.episodes:
-        raise InputError(
-            f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
-            f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
-        )
-
-
 def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
-    longest = config.episodes * config.max_steps
-    needed = 2 * VIDEOS[config.video].bytes_per_image * longest * len(OBS_TYPES[config.obs_type])
+    images = config.episodes * config.max_steps * len(OBS_TYPES[config.obs_type])
+    needed = 2 * VIDEOS[config.video].bytes_per_image * images
     disk = disk_of(root.parent)
     free = shutil.disk_usage(disk).free
     if free < needed:

@@ -1,4 +1,4 @@
-"""What a data set is generated from: the fields of `constructskill-generate`, and which of them frames depend on."""
+"""The settings of `constructskill-generate`, and which of them decide the bytes of frames."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -17,8 +17,6 @@ from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError
 
 LABELS = ("clean", "executed", "advice")
-
-Share = Annotated[float, Range(0, 10_000)]
 
 FRAME_PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
@@ -61,7 +59,7 @@ class GenerateConfig:
     episodes: Count = 80
     obs_type: Annotated[str, Among(tuple(OBS_TYPES))] = "pixels"
     max_steps: Steps = 1000
-    max_failures: Share = 1.0
+    max_failures: Annotated[float, Range(0, 10_000)] = 1.0
     seed_start: Seed = DEMO_SEED_START
     light_robot: bool | None = None
     labels: Annotated[str, Among(LABELS)] = "clean"
@@ -78,12 +76,19 @@ class GenerateConfig:
 
     @property
     def starts(self) -> range:
-        """Seeds of all attempts that it may take."""
+        """Seeds of all attempts that the generation may make."""
         return range(self.seed_start, self.seed_start + self.episodes + int(self.max_failures * self.episodes))
 
 
 def check_apart(starts: Mapping[str, range]) -> None:
-    """Raise InputError where two of some uses, each with the seeds of its starts, would have one start."""
+    """Refuse overlapping seeds.
+
+    Args:
+        starts: each use, such as "evaluation", and the seeds of its initial states.
+
+    Raises:
+        InputError: two uses share a seed.
+    """
     for (one, these), (other, those) in combinations(starts.items(), 2):
         if max(these.start, those.start) < min(these.stop, those.stop):
             raise InputError(
@@ -93,31 +98,27 @@ def check_apart(starts: Mapping[str, range]) -> None:
 
 
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What the data set says of its generation; nothing of where and how fast it ran."""
-    facts = asdict(config)
-    for name in ("root", "workers", "executor"):
-        del facts[name]
-    return facts
+    """The settings that a data set records: all but where and how fast it was generated."""
+    return {name: value for name, value in asdict(config).items() if name not in ("root", "workers", "executor")}
 
 
 def frames_digest(config: GenerateConfig) -> str:
-    """Digest of all that a frame's bytes depend on, so that shards of two kinds never meet in one data set.
+    """Digest of everything that the bytes of frames depend on, so that no data set mixes shards of two kinds.
 
-    What rendered a shard is known when it is there: `merge` refuses a mixture.
+    The renderer is left out, because it is known only once a shard exists; `merge` refuses a mixture of renderers.
     """
-    facts = generator_facts(config)
-    for name in ("repo_id", "episodes", "max_failures", "seed_start"):
-        del facts[name]
+    others = ("repo_id", "episodes", "max_failures", "seed_start")
+    facts = {name: value for name, value in generator_facts(config).items() if name not in others}
     return digest(facts | frame_facts(config) | {"versions": frame_versions(config.task)})
 
 
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
-    """What a data set depends on beside its settings: the encoder's options and the columns."""
+    """The encoder's options and the columns, on which a data set depends beside its settings."""
     columns = demonstration_features(get_task(config.task), config.obs_type)
     return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)}
 
 
 def frame_versions(task: str) -> dict[str, str]:
-    """What makes the frames of a task: packages, our rooms, and the source of another package's scene and expert."""
+    """Versions that decide frames: packages, our rooms, and the source of another package's scene and expert."""
     row = get_task(task)
     return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert, __name__)

@@ -1,4 +1,4 @@
-"""One attempt, one shard: a folder with the attempt's outcome and, if it succeeded, a data set of one episode."""
+"""Shards: the folder of an attempt, with its outcome and, if it succeeded, a data set of one episode."""
 
 import json
 import os
@@ -31,14 +31,14 @@ LATE = (
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of one seed.
+    """The outcome of one seed.
 
     Args:
         seed: of the environment and of the noise.
         success: whether the object was placed.
         frames: steps taken.
-        light_robot: how the robot was drawn where the attempt ran.
-        backend: what simulated and rendered it.
+        light_robot: whether the robot was drawn with decimated meshes.
+        backend: what simulated and rendered the attempt.
     """
 
     seed: int
@@ -74,19 +74,14 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
 
 @cache
 def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | None) -> ConstructSkillEnv:
-    """This process's simulator: its episodes do not remember each other, and a new one compiles shaders for 6 s."""
+    """The simulator of this process. Its episodes do not depend on each other; a new one compiles shaders for 6 s."""
     return ConstructSkillEnv(task, obs_type, max_steps, light_robot)
 
 
-def finished(folder: Path) -> dict[int, Attempt]:
-    """The attempts whose shards lie in `folder`, by seed."""
-    return {outcome.seed: outcome for outcome in whole(folder, OUTCOME, ATTEMPT.read)}
-
-
 def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> list[Kind]:
-    """What `read` makes of the outcome of each shard in `folder`.
+    """The outcome of each shard in `folder`, as `read` returns it.
 
-    A shard whose outcome a power cut left without its content, or another version wrote, is removed.
+    A shard whose outcome cannot be read, because of a power cut or another version of this package, is removed.
     """
     found = []
     for path in sorted(folder.glob(f"*/{outcome}")):

@@ -28,18 +28,15 @@ MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
 
 def action_bounds(count: int) -> tuple[np.ndarray, np.ndarray]:
     """The lowest and highest action of `count` channels, the gripper last, (A,) float32 in metres or radians."""
-    high = np.full(count, ACTION_SCALE, dtype=np.float32)
-    high[-1] = GRIPPER_OPEN
-    low = -high
-    low[-1] = GRIPPER_CLOSED
-    return low, high
+    motion = np.full(count - 1, ACTION_SCALE, dtype=np.float32)
+    return np.append(-motion, np.float32(GRIPPER_CLOSED)), np.append(motion, np.float32(GRIPPER_OPEN))
 
 
 def normalised(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Actions (..., A) with these channels in ManiSkill's numbers, of which those in [-1, 1] are within reach."""
+    """Actions (..., A) with the channels `names` in ManiSkill's numbers, whose range is [-1, 1]."""
     return actions / np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32)
 
 
 def within_reach(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """The same as they are executed, whatever was asked for: clipped to [-1, 1]."""
+    """Actions (..., A) in ManiSkill's numbers as they are executed: clipped to [-1, 1]."""
     return np.clip(normalised(actions, names), -1, 1)

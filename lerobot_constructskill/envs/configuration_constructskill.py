@@ -10,9 +10,9 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, Task, select_tasks
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
-from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType
+from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType, perturbed_task
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv, check_unperturbed
 from lerobot_constructskill.errors import InputError, heard_by_lerobot
@@ -54,36 +54,26 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     def __post_init__(self):
         with heard_by_lerobot():
-            rows = self._check()
-        self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),))}
-        self.features_map = {"action": "action"}
-        for name in OBS_TYPES[self.obs_type]:
-            key = CAMERAS[name].key
-            self.features[key] = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))
-            self.features_map[key] = key
+            check(self)
+            if self.max_parallel_tasks != 1:
+                raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
+            if self.vectorization == "native":
+                check_unperturbed(self.perturb)
+            tasks = [row.name for suite in select_tasks(self.task).values() for row in suite]
+            rows = [perturbed_task(name, self.perturb, self.perturb_seed)[0] for name in tasks]
+        image = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))
+        cameras = {CAMERAS[name].key: image for name in OBS_TYPES[self.obs_type]}
+        self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),)), **cameras}
+        self.features_map = {name: name for name in self.features}
         if self.obs_type == "pixels_agent_pos":
             self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
             self.features_map["agent_pos"] = "observation.state"
 
-    def _check(self) -> list[Task]:
-        """Return the tasks."""
-        check(self)
-        if self.max_parallel_tasks != 1:
-            raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
-        if self.vectorization == "native":
-            check_unperturbed(self.perturb)
-        rows = [row for suite in select_tasks(self.task).values() for row in suite]
-        for row in rows:
-            self._make_env(row.name)  # refuses what no environment can be made with
-        return rows
-
     @property
     def gym_kwargs(self) -> dict[str, Any]:
+        """Arguments of `ConstructSkillEnv`."""
         names = ("task", "obs_type", "episode_length", "light_robot", "render_backend", "perturb", "perturb_seed")
         return {name: getattr(self, name) for name in names}
-
-    def _make_env(self, task: str) -> ConstructSkillEnv:
-        return ConstructSkillEnv(**self.gym_kwargs | {"task": task})
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """`{suite: {task number: vector environment}}`; every sub-environment freezes after its episode's end."""
@@ -97,8 +87,7 @@ class ConstructSkillEnvConfig(EnvConfig):
         kwargs = self.gym_kwargs | {"task": task}
         if self.vectorization == "native":
             return NativeVectorEnv(n_envs, **kwargs)
-        env_fns = [partial(ConstructSkillEnv, **kwargs) for _ in range(n_envs)]
+        make = partial(ConstructSkillEnv, **kwargs)
         if use_async_envs and n_envs > 1:
-            env_fns = [partial(recording_into, os.environ.get(FOLDER), fn) for fn in env_fns]
-            return LazyAsyncVectorEnv(env_fns, self._make_env(task))
-        return SyncVectorEnv(env_fns)
+            return LazyAsyncVectorEnv([partial(recording_into, os.environ.get(FOLDER), make)] * n_envs, make())
+        return SyncVectorEnv([make] * n_envs)

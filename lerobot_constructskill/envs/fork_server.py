@@ -1,12 +1,7 @@
-"""The process that simulators' workers are forked from: what it has imported, no worker imports again."""
+"""Starts the process that simulators' workers are forked from, so that no worker repeats its imports."""
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from multiprocessing import forkserver
-
-NVML_CHECK = "PYTORCH_NVML_BASED_CUDA_CHECK"
-"""With it, torch asks the driver's NVML whether there is a GPU, and does not initialise CUDA for the answer."""
 
 
 def start_fork_server(preload: Sequence[str]) -> None:
@@ -17,19 +12,5 @@ def start_fork_server(preload: Sequence[str]) -> None:
     """
     import lerobot_constructskill.sim  # noqa: F401  names Vulkan's drivers, which the server hands on
 
-    forkserver.set_forkserver_preload(list(preload))
-    with _set(NVML_CHECK, "1"):
-        forkserver.ensure_running()
-
-
-@contextmanager
-def _set(name: str, value: str) -> Iterator[None]:
-    before = os.environ.get(name)
-    os.environ[name] = value
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
-        else:
-            os.environ[name] = before
+    forkserver.set_forkserver_preload(["lerobot_constructskill.envs.no_cuda", *preload])
+    forkserver.ensure_running()

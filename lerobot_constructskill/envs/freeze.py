@@ -1,4 +1,4 @@
-"""Sub-environments that stand still after their episode's end, until somebody resets the vector environment."""
+"""Vector environments whose sub-environments freeze at their episode's end, until the next `reset`."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -19,10 +19,10 @@ PRELOADED = ("lerobot.envs.utils", "lerobot_constructskill.sim.register")
 
 
 class FrozenAtEnd(FreezeAfterEpisodeEnd):
-    """LeRobot's, which only an option of its own thaws, thawed by every `reset` of the vector environment.
+    """LeRobot's wrapper, which only LeRobot's own option thaws, thawed by every `reset` of the vector environment.
 
-    A vector environment hands its seed and options on, also where they are None; its autoreset, which has to find the
-    episode as it ended, hands on nothing.
+    A vector environment's `reset` passes seed and options, even if they are None. Its autoreset, which must find the
+    episode as it ended, passes nothing.
     """
 
     def reset(self, **given: Any) -> tuple[Any, dict[str, Any]]:
@@ -55,7 +55,7 @@ class StaysDone:
 
 
 class SyncVectorEnv(StaysDone, gym.vector.SyncVectorEnv):
-    """Gymnasium's, of environments that freeze at their episode's end."""
+    """Gymnasium's synchronous vector environment, of environments that freeze at their episode's end."""
 
     def __init__(self, env_fns: list[Callable[[], gym.Env]]):
         super().__init__([lambda fn=fn: FrozenAtEnd(fn()) for fn in env_fns])
@@ -63,9 +63,9 @@ class SyncVectorEnv(StaysDone, gym.vector.SyncVectorEnv):
 
 
 class LazyAsyncVectorEnv(StaysDone, _LazyAsyncVectorEnv):
-    """LeRobot's, whose workers freeze by themselves, thawed by every `reset` too.
+    """LeRobot's asynchronous vector environment, whose workers freeze by themselves, thawed by every `reset`.
 
-    The workers are forked when they are first needed, from a server that has imported what they need.
+    The workers are forked when they are first needed, from a server that has already made their imports.
     """
 
     def __init__(self, env_fns: list[Callable[[], gym.Env]], probe: gym.Env):
@@ -82,5 +82,5 @@ class LazyAsyncVectorEnv(StaysDone, _LazyAsyncVectorEnv):
 
 
 def thawing(seed: Any = None, options: dict[str, Any] | None = None) -> dict[str, Any]:
-    """What a `reset` is given, with LeRobot's own word that an episode is to begin."""
+    """Arguments of a `reset`, with LeRobot's option that begins a new episode."""
     return {"seed": seed, "options": (options or {}) | {NEW_ROLLOUT_OPTION: True}}

@@ -19,6 +19,7 @@ from lerobot_constructskill.contract import (
     LADDER,
     OBS_TYPES,
     STATE_NAMES,
+    Task,
     get_task,
 )
 from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
@@ -29,9 +30,21 @@ from lerobot_constructskill.perturbations import Perturbation
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
-RenderBackend = Annotated[str, Among((*SEEING, "none"))]
 
-UNBORN = "Call reset() first: the simulator is born on the first reset."
+
+def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Perturbation]:
+    """The task and its perturbation.
+
+    Raises:
+        InputError: no such task, axis or level, or a brick of another size where none is or where it does not fit.
+    """
+    task, perturbation = get_task(name), Perturbation(perturb, perturb_seed)
+    perturbation.check(task)
+    if perturbation.amount("size") and name in LADDER:
+        from lerobot_constructskill.sim.perturb import Draws, check_fits
+
+        check_fits(Draws(perturbation).brick(BRICK), LADDER[name])
+    return task, perturbation
 
 
 class ConstructSkillEnv(gym.Env):
@@ -43,7 +56,7 @@ class ConstructSkillEnv(gym.Env):
     the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success`, the named booleans of the scene
     and `clipped_steps`, how many of the episode's actions were clipped; after a reset also `contract`, as JSON.
 
-    Non-obvious behaviours: the simulator is born on the first `reset`, in the process that calls it, so
+    Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
 
     Args:
@@ -65,23 +78,23 @@ class ConstructSkillEnv(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
     render_mode = "rgb_array"
 
+    num_copies = 1
+    """Copies of the task in the simulator; `NativeVectorEnv` steps several."""
+
     def __init__(
         self,
         task: str = "brick_to_bin",
         obs_type: ObsType = "pixels",
         episode_length: Steps | None = None,
         light_robot: bool | None = None,
-        render_backend: RenderBackend = "auto",
+        render_backend: Annotated[str, Among((*SEEING, "none"))] = "auto",
         perturb: str = "",
         perturb_seed: Seed = 0,
         cameras: tuple[str, ...] | None = None,
     ):
         check_fields(ConstructSkillEnv.__init__, locals())
-        self._perturbation = Perturbation(perturb, perturb_seed)
-        self._row = get_task(task)
-        self._perturbation.check(self._row)
+        self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed)
         self.task = task
-        self._check_fits()
         self.task_description = self._row.instruction
         self.obs_type = obs_type
         self._max_episode_steps = episode_length or self._row.horizon
@@ -89,8 +102,13 @@ class ConstructSkillEnv(gym.Env):
         if not set(offered).issuperset(cameras := offered if cameras is None else cameras) or not cameras:
             raise InputError(f"cameras must be some of {', '.join(offered)}, which {obs_type} has, not {cameras}.")
         self.cameras = () if render_backend == "none" else tuple(name for name in offered if name in cameras)
-        self._told = {"task": task, "episode_length": self._max_episode_steps, "obs_type": obs_type}
-        self._told |= {"perturb": perturb, "perturb_seed": perturb_seed}
+        self._settings = {
+            "task": task,
+            "episode_length": self._max_episode_steps,
+            "obs_type": obs_type,
+            "perturb": perturb,
+            "perturb_seed": perturb_seed,
+        }
         self._scene_kwargs = {
             "cameras": self.cameras,
             "light_robot": light_robot,
@@ -98,24 +116,14 @@ class ConstructSkillEnv(gym.Env):
             "perturbation": self._perturbation,
         }
         self._env = None
-        self._has_started = False
-        self._steps = 0
+        self._steps: int | None = None  # of the episode; None where none has begun
         self._recording = None
-        self.observation_space = self._make_observation_space()
-        self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
-
-    def _check_fits(self) -> None:
-        if self._perturbation.amount("size") and self.task in LADDER:
-            from lerobot_constructskill.sim.perturb import Draws, check_fits
-
-            check_fits(Draws(self._perturbation).brick(BRICK), LADDER[self.task])
-
-    def _make_observation_space(self) -> spaces.Dict:
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         space = {"pixels": spaces.Dict(dict.fromkeys(self.cameras, image))}
-        if self.obs_type == "pixels_agent_pos":
+        if obs_type == "pixels_agent_pos":
             space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
-        return spaces.Dict(space)
+        self.observation_space = spaces.Dict(space)
+        self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
 
     # Gymnasium
 
@@ -126,15 +134,12 @@ class ConstructSkillEnv(gym.Env):
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**31))
-        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
-        obs, info = self._ensure_env().reset(seed=seed, options={"reconfigure": self._steps > 0})
-        self._has_started = True
-        self._steps = 0
+        obs, info = self.begin(seed)
         self._pixel_rngs = {
             name: np.random.default_rng([seed, self._perturbation.seed, zlib.crc32(f"sensor {name}".encode())])
             for name in self.cameras
         }
-        self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._told)
+        self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._settings)
         return self._observation(obs), self._info(info) | {"contract": json.dumps(self.contract)}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -144,9 +149,8 @@ class ConstructSkillEnv(gym.Env):
             RuntimeError: before the first `reset`.
             ValueError: an action of another shape, or not finite.
         """
-        obs, reward, terminated, _, info = self._started().step(self.maniskill_action(action))
-        self._steps += 1
-        terminated, truncated, info = bool(terminated[0]), self._steps >= self._max_episode_steps, self._info(info)
+        obs, reward, terminated, truncated, info = self.advance(self.maniskill_action(action))
+        terminated, info = bool(terminated[0]), self._info(info)
         if self._recording is not None:
             self._recording.add(action, info)
             if terminated or truncated:
@@ -156,13 +160,12 @@ class ConstructSkillEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """A close-up of the scene, (H, W, 3) uint8. Raises as `step` does."""
-        return self._started().render()[0].cpu().numpy()
+        return self.started().render()[0].cpu().numpy()
 
     def close(self) -> None:
         if self._env is not None:
             self._env.close()
-            self._env = None
-            self._has_started = False
+            self._env = self._steps = None
 
     @property
     def contract(self) -> dict[str, Any]:
@@ -173,12 +176,12 @@ class ConstructSkillEnv(gym.Env):
 
     def privileged_state(self) -> dict[str, np.ndarray]:
         """The simulator's state, `contract.SIM_STATE` name to float32 array. Raises as `step` does."""
-        state = self._started().privileged_state()
+        state = self.started().privileged_state()
         return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
 
     def agent_state(self) -> np.ndarray:
         """Proprioception as `contract.STATE_NAMES` names it, (8,) float32. Raises as `step` does."""
-        return self._started().agent_state()[0].cpu().numpy().astype(np.float32)
+        return self.started().agent_state()[0].cpu().numpy().astype(np.float32)
 
     @property
     def light_robot(self) -> bool:
@@ -193,8 +196,8 @@ class ConstructSkillEnv(gym.Env):
 
     # ManiSkill
 
-    def make_scene(self, num_envs: int = 1) -> gym.Env:
-        """The task's ManiSkill environment; several copies of it in one simulator need a GPU.
+    def make_scene(self) -> gym.Env:
+        """The task's ManiSkill environment; several copies in one simulator need a GPU.
 
         Raises:
             InputError: the task is another package's, whose scene cannot be imported.
@@ -209,7 +212,7 @@ class ConstructSkillEnv(gym.Env):
         _spare_imports()
         return gym.make(
             self._row.env_id,
-            num_envs=num_envs,
+            num_envs=self.num_copies,
             obs_mode="rgb" if self.cameras else "none",
             reward_mode="sparse",
             render_mode="rgb_array" if self.cameras else None,
@@ -223,13 +226,31 @@ class ConstructSkillEnv(gym.Env):
             self._env = self.make_scene()
         return self._env
 
-    def _started(self) -> gym.Env:
-        if not self._has_started:
-            raise RuntimeError(UNBORN)
+    def started(self) -> gym.Env:
+        """The ManiSkill environment of the episode that has begun.
+
+        Raises:
+            RuntimeError: before the first `reset`.
+        """
+        if self._steps is None:
+            raise RuntimeError("Call reset() first: the simulator starts with the first reset.")
         return self._env
 
+    def begin(self, seed: int | list[int]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Reset the ManiSkill environment; return its observation and info, of all copies."""
+        # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
+        result = self._ensure_env().reset(seed=seed, options={"reconfigure": bool(self._steps)})
+        self._steps = 0
+        return result
+
+    def advance(self, action: np.ndarray) -> tuple[dict[str, Any], Any, Any, bool, dict[str, Any]]:
+        """Step the ManiSkill environment by `action`, (7,) or (num_copies, 7); all copies are truncated together."""
+        obs, reward, terminated, _, info = self.started().step(action)
+        self._steps += 1
+        return obs, reward, terminated, self._steps >= self._max_episode_steps, info
+
     def maniskill_action(self, action: np.ndarray) -> np.ndarray:
-        """ManiSkill's normalised `pd_ee_delta_pose` action, (7,), for one of ours; the scene clips it to [-1, 1]."""
+        """Convert an action, (A,), to ManiSkill's `pd_ee_delta_pose`, (7,); the scene clips it to [-1, 1]."""
         action = np.asarray(action, dtype=np.float32)
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():
@@ -238,13 +259,18 @@ class ConstructSkillEnv(gym.Env):
         scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = normalised(action, names)
         return scaled
 
+    def observations(self, obs: dict[str, Any]) -> dict[str, Any]:
+        """The observation of every copy, arrays (num_copies, ...), without the noise of a perturbed sensor."""
+        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in self.cameras}}
+        if self.obs_type == "pixels_agent_pos":
+            seen["agent_pos"] = self.started().agent_state().cpu().numpy().astype(np.float32)
+        return seen
+
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
-        # In one piece: what has gaps takes four times as long to be sent to another process.
-        pictures = {name: obs["sensor_data"][name]["rgb"][0].contiguous().cpu().numpy() for name in self.cameras}
-        pixels = {name: self._sensed(name, picture) for name, picture in pictures.items()}
-        if self.obs_type == "pixels":
-            return {"pixels": pixels}
-        return {"pixels": pixels, "agent_pos": self.agent_state()}
+        seen = self.observations(obs)
+        # Contiguous: an array with gaps takes four times as long to be sent to another process.
+        pixels = {name: self._sensed(name, np.ascontiguousarray(one[0])) for name, one in seen["pixels"].items()}
+        return {name: one[0] for name, one in seen.items() if name != "pixels"} | {"pixels": pixels}
 
     def _sensed(self, camera: str, image: np.ndarray) -> np.ndarray:
         """`image`, (H, W, 3) uint8, as a noisy sensor sees it."""
@@ -255,16 +281,21 @@ class ConstructSkillEnv(gym.Env):
         return np.clip(noisy.round(), 0, 255).astype(np.uint8)
 
     def _info(self, info: dict[str, Any]) -> dict[str, Any]:
-        booleans = {name: bool(value[0]) for name, value in info.items() if name.startswith("is_")}
-        return {"is_success": bool(info["success"][0]), **booleans, "clipped_steps": int(info["clipped_steps"][0])}
+        return {name: value[0].item() for name, value in public_info(info).items()}
+
+
+def public_info(info: dict[str, Any]) -> dict[str, Any]:
+    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans, and the number of clipped steps."""
+    booleans = {name: value for name, value in info.items() if name.startswith("is_")}
+    return {"is_success": info["success"], **booleans, "clipped_steps": info["clipped_steps"]}
 
 
 @functools.cache
 def _spare_imports() -> None:
-    """In a worker process, keep what there is by now from the garbage collector.
+    """In a worker process, exempt all present objects from garbage collection.
 
-    ManiSkill has it look at every object whenever a scene ends, and a million imported ones took most of a reset. Any
-    other process is its user's, whose objects have to stay collectable.
+    ManiSkill collects garbage whenever a scene ends, and the million objects of imported modules took most of a
+    reset. Other processes belong to the user, whose objects have to stay collectable.
     """
     if multiprocessing.parent_process() is not None:
         gc.collect()
@@ -272,9 +303,9 @@ def _spare_imports() -> None:
 
 
 def resolve_rendering(light_robot: bool | None = None, render_backend: str = "auto") -> tuple[bool | None, str]:
-    """What `light_robot` and `render_backend` mean on this machine; as they are where there is no simulator."""
+    """Resolve `light_robot` and `render_backend` for this machine; without a simulator they stay as they are."""
     try:
-        from lerobot_constructskill.sim.rendering import best_render_backend
+        from lerobot_constructskill.sim.backends import best_render_backend
     except ModuleNotFoundError:
         return light_robot, render_backend
     backend = best_render_backend() if render_backend == "auto" else render_backend

@@ -14,7 +14,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from lerobot_constructskill.envs.gym_env import UNBORN, ConstructSkillEnv
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, public_info
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import InputError
 
@@ -46,17 +46,15 @@ class NativeVectorEnv(gym.vector.VectorEnv):
             raise InputError(f"${FOLDER} records one environment per simulator only; use vectorization=process.")
         check_unperturbed(kwargs.get("perturb", ""))
         self._single = ConstructSkillEnv(**kwargs)
-        self.num_envs = n_envs
+        self.num_envs = self._single.num_copies = n_envs
         self.metadata = ConstructSkillEnv.metadata | {"autoreset_mode": gym.vector.AutoresetMode.DISABLED}
         self.render_mode = ConstructSkillEnv.render_mode
         self.single_observation_space = self._single.observation_space
         self.single_action_space = self._single.action_space
         self.observation_space = batch_space(self.single_observation_space, n_envs)
         self.action_space = batch_space(self.single_action_space, n_envs)
-        self._env = None
-        self._steps = 0
         self._done = np.zeros(n_envs, dtype=bool)
-        self._terminal: tuple | None = None
+        self._last: tuple | None = None
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
@@ -74,14 +72,10 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         seeds = self.np_random.integers(2**31, size=self.num_envs) if seed is None else seed
         if len(seeds) != self.num_envs:
             raise InputError(f"{self.num_envs} environments need as many seeds, not {len(seeds)}.")
-        if self._env is None:
-            self._env = self._single.make_scene(self.num_envs)
-        # As in `ConstructSkillEnv`: PhysX would keep contacts.
-        obs, info = self._env.reset(seed=[int(s) for s in seeds], options={"reconfigure": self._steps > 0})
-        self._steps = 0
+        obs, info = self._single.begin([int(one) for one in seeds])
         self._done[:] = False
         contract = np.full(self.num_envs, json.dumps(self._single.contract), dtype=object)
-        return self._observations(obs), self._infos(info) | {"contract": contract}
+        return self._single.observations(obs), self._infos(info) | {"contract": contract}
 
     def step(self, actions: np.ndarray) -> tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance 1/20 s; `actions` are (n_envs, A) in metres.
@@ -89,19 +83,15 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        self._check_started()
         scaled = np.stack([self._single.maniskill_action(action) for action in actions])
-        obs, reward, terminated, _, info = self._env.step(scaled)
-        self._steps += 1
-        truncated = np.full(self.num_envs, self._steps >= self._single._max_episode_steps)
-        outcome = reward.cpu().numpy(), terminated.cpu().numpy(), truncated
-        transition = self._observations(obs), *outcome, self._infos(info)
-        if self._done.any():
-            transition = _keep(self._terminal, transition, self._done)
-        obs, reward, terminated, truncated, info = transition
-        self._terminal = obs, np.zeros_like(reward), terminated, truncated, info
+        obs, reward, terminated, truncated, info = self._single.advance(scaled)
+        outcome = reward.cpu().numpy(), terminated.cpu().numpy(), np.full(self.num_envs, truncated)
+        obs, reward, terminated, truncated, info = _keep(
+            self._last, (self._single.observations(obs), *outcome, self._infos(info)), self._done
+        )
+        self._last = obs, np.zeros_like(reward), terminated, truncated, info
         self._done = terminated | truncated
-        return transition
+        return obs, reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...]:
         """A close-up of every environment, each (H, W, 3) uint8.
@@ -109,8 +99,7 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         Raises:
             RuntimeError: before the first `reset`.
         """
-        self._check_started()
-        return tuple(self._env.render().cpu().numpy())
+        return tuple(self._single.started().render().cpu().numpy())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """The attribute or method `name` of every environment."""
@@ -123,28 +112,16 @@ class NativeVectorEnv(gym.vector.VectorEnv):
         return self.call(name)
 
     def close_extras(self, **kwargs: Any) -> None:
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-
-    def _check_started(self) -> None:
-        if self._env is None:
-            raise RuntimeError(UNBORN)
-
-    def _observations(self, obs: dict[str, Any]) -> dict[str, Any]:
-        cameras = self._single.cameras
-        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in cameras}}
-        if self._single.obs_type == "pixels_agent_pos":
-            seen["agent_pos"] = self._env.agent_state().cpu().numpy().astype(np.float32)
-        return seen
+        self._single.close()
 
     def _infos(self, info: dict[str, Any]) -> dict[str, np.ndarray]:
-        names = [name for name in info if name.startswith("is_")] + ["clipped_steps"]
-        return {"is_success": info["success"].cpu().numpy(), **{name: info[name].cpu().numpy() for name in names}}
+        return {name: value.cpu().numpy() for name, value in public_info(info).items()}
 
 
 def _keep(old: Any, new: Any, frozen: np.ndarray) -> Any:
-    """`new` with the rows of `old` where `frozen`, through tuples and dicts of arrays."""
+    """Replace the rows of `new` where `frozen` by those of `old`, in tuples and dicts of arrays."""
+    if not frozen.any():
+        return new
     if isinstance(new, tuple):
         return tuple(_keep(a, b, frozen) for a, b in zip(old, new, strict=True))
     if isinstance(new, dict):

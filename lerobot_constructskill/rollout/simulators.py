@@ -18,7 +18,7 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError, full_traceback
 
 PRELOADED = [
-    "lerobot_constructskill.artifacts.mortal",
+    "lerobot_constructskill.artifacts.ends_with_parent",
     "lerobot_constructskill.sim.register",
     "lerobot_constructskill.rollout.simulators",
 ]

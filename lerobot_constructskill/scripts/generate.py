@@ -8,14 +8,15 @@ from lerobot_constructskill.scripts.console import run, say
 def generate(config: GenerateConfig) -> str:
     from lerobot_constructskill.scripts.card import CardConfig, write_card
 
-    summary = record(config)
+    root, attempts = record(config)
+    lengths = [attempt.frames for attempt in attempts if attempt.success]
     try:
-        say(write_card(CardConfig(summary.root)))
+        say(write_card(CardConfig(root)))
     except ModuleNotFoundError as error:  # the demonstrations are whole; constructskill-card writes it later
         say(f"No card: {remedy_of(error) or error}")
     return (
-        f"{plural(summary.episodes, 'demonstration')}, {plural(summary.frames, 'frame')}, "
-        f"{plural(len(summary.discarded_seeds), 'attempt')} discarded: {summary.root}"
+        f"{plural(len(lengths), 'demonstration')}, {plural(sum(lengths), 'frame')}, "
+        f"{plural(len(attempts) - len(lengths), 'attempt')} discarded: {root}"
     )
 
 

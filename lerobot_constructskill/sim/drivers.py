@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,16 +18,11 @@ def show_all_drivers() -> None:
     Call it before the first import of SAPIEN, which does so where an NVIDIA GPU has its driver file not in
     /usr/share/vulkan/icd.d. Container toolkits put it into /etc/vulkan/icd.d. What the user has chosen stays.
     """
-    if named := _drivers(os.environ):
-        os.environ["VK_ICD_FILENAMES"] = os.pathsep.join(map(str, named))
-
-
-def _drivers(surroundings: Mapping[str, str]) -> list[Path]:
-    """The drivers to name; none where SAPIEN names none."""
     is_usual = (FOLDERS[-1] / "nvidia_icd.json").is_file()
-    if is_usual or any(map(surroundings.get, CHOICES)) or shutil.which("nvidia-smi") is None:
-        return []
+    if is_usual or any(map(os.environ.get, CHOICES)) or shutil.which("nvidia-smi") is None:
+        return
     found = [file for folder in FOLDERS for file in sorted(folder.glob("*.json"))]
     if not any("nvidia" in file.name for file in found) and (sapien := find_spec("sapien")):
         found.append(Path(sapien.origin).parent / "vulkan_library" / "nvidia_icd.json")
-    return found
+    if found:
+        os.environ["VK_ICD_FILENAMES"] = os.pathsep.join(map(str, found))

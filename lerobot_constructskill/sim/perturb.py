@@ -1,4 +1,4 @@
-"""What a perturbation does to a scene: numbers drawn once, from the axis and the perturbation's seed."""
+"""Draws what a perturbation changes in a scene, once, from the axis and the perturbation's seed."""
 
 import zlib
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ def check_fits(size: tuple[float, ...], clearance: float) -> None:
 
 @dataclass(frozen=True)
 class Draws:
-    """The draws of one scene. Where an axis is not perturbed every method gives back what it was given."""
+    """The draws of one scene. Every method returns its argument unchanged where its axis is not perturbed."""
 
     perturbation: Perturbation
 

@@ -19,8 +19,10 @@ def register(task: Task) -> None:
     try:
         import_module(module)
     except (Exception, SystemExit) as error:  # whatever the code of another package may raise
-        said = f"{type(error).__name__}: {first_line(error)}"
-        raise InputError(f"The scene of the task '{task.name}', {task.scene}, cannot be imported ({said}).") from error
+        raise InputError(
+            f"The scene of the task '{task.name}', {task.scene}, cannot be imported ({type(error).__name__}: "
+            f"{first_line(error)})."
+        ) from error
     made = REGISTERED_ENVS.get(task.env_id)
     if made is None or made.cls.__module__ != module:
         raise InputError(

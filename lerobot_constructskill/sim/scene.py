@@ -3,7 +3,9 @@
 A task derives from `PickPlaceEnv`, loads its asset and, where the layout differs, sets four geometry constants.
 """
 
+from collections.abc import Callable, Sequence
 from functools import cache
+from itertools import chain
 
 import numpy as np
 import sapien
@@ -14,7 +16,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SimConfig
 from transforms3d.euler import euler2quat
 
@@ -31,15 +33,11 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.sim.autocast import outside_autocast
-from lerobot_constructskill.sim.clipping import Clipping
-from lerobot_constructskill.sim.gpu_physics import enable_gpu_physics, steps_on_gpu
-from lerobot_constructskill.sim.hold import HOLDING, Hold
+from lerobot_constructskill.sim.actions import HOLDING, Clipping, Hold
+from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
 from lerobot_constructskill.sim.perturb import Draws
-from lerobot_constructskill.sim.poses import looking_from, seen_from
-from lerobot_constructskill.sim.rendering import best_render_backend, machine_lacks
-from lerobot_constructskill.sim.shader import colour_shader
-from lerobot_constructskill.sim.visuals import LightPanda, QuickPanda, mottled, textured
+from lerobot_constructskill.sim.robot import LightPanda, QuickPanda, seen_from
+from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, textured
 
 WALL = 0.005
 """Thickness of the bin's walls and floor, in metres (paper, section II)."""
@@ -67,6 +65,14 @@ def keep_software_renderer() -> sapien.render.RenderSystem:
     for each further environment.
     """
     return sapien.render.RenderSystem("cpu")
+
+
+def outside_autocast[**P, R](method: Callable[P, R]) -> Callable[P, R]:
+    """Have a method compute in full precision, whatever autocast surrounds its call.
+
+    With `use_amp`, `lerobot-eval` steps its environments under the same autocast as the policy.
+    """
+    return torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(method))
 
 
 class PickPlaceEnv(BaseEnv):
@@ -136,10 +142,9 @@ class PickPlaceEnv(BaseEnv):
         **kwargs,
     ):
         self.draws = Draws(perturbation or Perturbation())
-        if self.draws.perturbation.amount("size"):
-            if not self.is_brick:
-                raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
-            self.object_size = self.draws.brick(self.object_size)
+        if self.draws.perturbation.amount("size") and not self.is_brick:
+            raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
+        self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
         elif render_backend == "gpu" and best_render_backend() != "gpu":
@@ -155,8 +160,7 @@ class PickPlaceEnv(BaseEnv):
         self.cameras = tuple(cameras)
         in_software = render_backend in ("cpu", "sapien_cpu")
         self.light_robot = in_software if light_robot is None else light_robot
-        if robot_uids is None:
-            robot_uids = LightPanda.uid if self.light_robot else QuickPanda.uid
+        robot = LightPanda if self.light_robot else QuickPanda
         if steps_on_gpu(kwargs.get("sim_backend", "auto"), kwargs.get("num_envs", 1)):
             enable_gpu_physics(in_software)
         try:
@@ -164,7 +168,7 @@ class PickPlaceEnv(BaseEnv):
                 keep_software_renderer()
             super().__init__(
                 *args,
-                robot_uids=robot_uids,
+                robot_uids=robot_uids or robot.uid,
                 control_mode=control_mode,
                 render_backend=render_backend,
                 **kwargs,
@@ -200,14 +204,11 @@ class PickPlaceEnv(BaseEnv):
         else:  # looks along the hand's approach axis
             pose = sapien.Pose(p=camera.eye, q=euler2quat(0, -np.pi / 2, 0))
             view = {"pose": pose, "mount": self.agent.robot.links_map[camera.mount]}
-        shader = colour_shader() if self._is_colour_enough() else None
+        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
+        is_colour_enough = asked == {"rgb"} and not self.backend.render_device.is_cuda()
+        shader = colour_shader() if is_colour_enough else None
         size = {"width": IMAGE_SIZE, "height": IMAGE_SIZE}
         return CameraConfig(camera.name, fov=camera.fov, shader_config=shader, **size, **view)
-
-    def _is_colour_enough(self) -> bool:
-        """Whether observations are colour pictures alone, rendered on a CPU."""
-        asked = {name for name, is_asked in vars(self.obs_mode_struct.visual).items() if is_asked}
-        return asked == {"rgb"} and not self.backend.render_device.is_cuda()
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
@@ -220,14 +221,16 @@ class PickPlaceEnv(BaseEnv):
     def _load_scene(self, options: dict) -> None:
         self._load_hall()
         self._load_offcuts()
-        self.bin = self._load_bin()
+        builder = self.scene.create_actor_builder()
+        self._load_bin(builder)
+        builder.initial_pose = sapien.Pose(p=self.bin_position)
+        self.bin = builder.build_kinematic(name="bin")
         builder = self.scene.create_actor_builder()
         self._load_object(builder)
         builder.initial_pose = sapien.Pose(p=[*self.object_center, self.object_size[2] / 2])
         self.object = builder.build_dynamic(name="object")
         self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._placed = torch.zeros_like(self._lifted)
-        self._last_unsettled = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._placements: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
         self._clipping = Clipping(self.num_envs, self.device)
 
     def _load_hall(self) -> None:
@@ -252,8 +255,7 @@ class PickPlaceEnv(BaseEnv):
         way = np.linspace(ends[0], ends[1], 5)
         for i, (size, place) in enumerate(self.draws.offcuts(np.vstack([ends, way]), self.spawn_range + 0.18)):
             builder = self.scene.create_actor_builder()
-            builder.add_box_collision(half_size=size / 2)
-            builder.add_box_visual(half_size=size / 2, material=(0.55, 0.38, 0.20))
+            self._add_box(builder, [0, 0, 0], size, (0.55, 0.38, 0.20))
             builder.initial_pose = sapien.Pose(p=place)
             builder.build_static(name=f"offcut_{i}")
 
@@ -262,29 +264,45 @@ class PickPlaceEnv(BaseEnv):
         self.scene.add_directional_light(*self.draws.light([1, 1, -1], [0.9, 0.9, 0.9]), shadow=self.enable_shadow)
         self.scene.add_directional_light(*self.draws.light([0, 0, -1], [0.6, 0.6, 0.6]))
 
-    def _load_bin(self) -> Actor:
-        """A floor and four walls around `bin_interior`, standing on the ground."""
-        x, y, z = (extent / 2 for extent in self.bin_interior)
-        t = WALL / 2
-        panels = [([0, 0, -z - t], [x + WALL, y + WALL, t])]
-        panels += [([side * (x + t), 0, 0], [t, y + WALL, z]) for side in (-1, 1)]
-        panels += [([0, side * (y + t), 0], [x, t, z]) for side in (-1, 1)]
-        builder = self.scene.create_actor_builder()
-        for center, half_size in panels:
-            builder.add_box_collision(sapien.Pose(center), half_size)
-            builder.add_box_visual(sapien.Pose(center), half_size, material=(0.10, 0.22, 0.42))
-        builder.initial_pose = sapien.Pose(p=self.bin_position)
-        return builder.build_kinematic(name="bin")
+    def _load_bin(self, builder: ActorBuilder) -> None:
+        """Give `builder` the receptacle's collision shapes and visuals; its origin is the middle of `bin_interior`.
+
+        By default a floor and four walls around `bin_interior`.
+        """
+        x, y, z = self.bin_interior
+        panels = [([0, 0, -(z + WALL) / 2], [x + 2 * WALL, y + 2 * WALL, WALL])]
+        panels += [([side * (x + WALL) / 2, 0, 0], [WALL, y + 2 * WALL, z]) for side in (-1, 1)]
+        panels += [([0, side * (y + WALL) / 2, 0], [x, WALL, z]) for side in (-1, 1)]
+        for center, size in panels:
+            self._add_box(builder, center, size, (0.10, 0.22, 0.42))
+
+    def _add_box(
+        self,
+        builder: ActorBuilder,
+        center: Sequence[float] | sapien.Pose,
+        size: Sequence[float],
+        look: tuple[float, float, float] | np.ndarray,
+        density: float = 1000.0,
+    ) -> None:
+        """Add a box to an actor, which collides and is seen.
+
+        Args:
+            center: position in the actor's frame, (3,) metres, or a pose in it.
+            size: edges in metres, (3,).
+            look: colour as RGB from 0 to 1, or a texture, (H, W, 3) uint8.
+            density: kg/m3.
+        """
+        pose = center if isinstance(center, sapien.Pose) else sapien.Pose(center)
+        half_size = np.array(size) / 2
+        builder.add_box_collision(pose, half_size, density=density)
+        if self.scene.can_render():
+            material = textured(look) if isinstance(look, np.ndarray) else look
+            builder.add_box_visual(pose, half_size, material=material)
 
     # Gymnasium
 
-    @outside_autocast
-    def reset(self, *args, **kwargs):
-        return super().reset(*args, **kwargs)
-
-    @outside_autocast
-    def step(self, action):
-        return super().step(action)
+    reset = outside_autocast(BaseEnv.reset)
+    step = outside_autocast(BaseEnv.step)
 
     # Initial state
 
@@ -305,13 +323,11 @@ class PickPlaceEnv(BaseEnv):
             zero = torch.zeros_like(half_yaw)
             quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
             self.object.set_pose(Pose.create_from_pq(position, quaternion))
-            self._lifted[env_idx] = False
-            self._placed[env_idx] = False
-            self._last_unsettled[env_idx] = 0
-            self._clipping.steps[env_idx] = 0
+            for memory in (self._lifted, self._clipping.steps, *chain(*self._placements.values())):
+                memory[env_idx] = 0
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
-        """The rest keyframe, or near it where the robot's pose is perturbed, (9,) or (len(env_idx), 9) radians."""
+        """Joint positions of the rest keyframe, with noise where the pose is perturbed, (9,) or (len(env_idx), 9)."""
         rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")
         if not amount:
             return rest
@@ -362,17 +378,29 @@ class PickPlaceEnv(BaseEnv):
         is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
         self._lifted |= center[:, 2] >= LIFT_HEIGHT
-        settled = is_in_bin & is_gripper_open
-        self._last_unsettled = torch.where(settled, self._last_unsettled, self.elapsed_steps)
-        self._placed |= self.elapsed_steps - self._last_unsettled >= PLACED_STEPS
+        is_placed = self._has_lasted("is_placed", is_in_bin & is_gripper_open)
         return {
             "is_lifted": self._lifted.clone(),
             "is_in_bin": is_in_bin,
             "is_gripper_open": is_gripper_open,
-            "is_placed": self._placed.clone(),
-            "success": self._placed.clone(),
+            "is_placed": is_placed,
+            "success": is_placed.clone(),
             "clipped_steps": self._clipping.steps.clone(),
         }
+
+    def _has_lasted(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
+        """Whether a condition was met in `PLACED_STEPS` consecutive steps of the episode, (num_envs,) booleans.
+
+        Args:
+            name: of the condition, by which its memory is kept.
+            is_met: whether it is met now, (num_envs,).
+        """
+        new = torch.zeros_like(is_met), torch.zeros_like(self.elapsed_steps)
+        has_lasted, last_unmet = self._placements.get(name, new)
+        last_unmet = torch.where(is_met, last_unmet, self.elapsed_steps)
+        has_lasted = has_lasted | (self.elapsed_steps - last_unmet >= PLACED_STEPS)
+        self._placements[name] = has_lasted, last_unmet
+        return has_lasted.clone()
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:
         """The stage reached, of shape (num_envs,)."""
@@ -386,11 +414,6 @@ class PickPlaceEnv(BaseEnv):
         if "state" in self.obs_mode:
             extra |= {"object_pose": self.object.pose.raw_pose, "bin_position": self.bin.pose.p}
         return extra
-
-    @property
-    def object_mass(self) -> float:
-        """In kilograms."""
-        return float(self.object.mass[0])
 
     @outside_autocast
     def agent_state(self) -> torch.Tensor:
@@ -406,21 +429,21 @@ class PickPlaceEnv(BaseEnv):
 
     @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
-        """What an expert may know, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
+        """The state that experts read, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
+        joints = self.agent.robot.get_qpos()
         constants = {
             "object_size": self.object_size,
-            "object_mass": [self.object_mass],
+            "object_mass": [float(self.object.mass[0])],
             "bin_interior": self.bin_interior,
         }
-        joints = self.agent.robot.get_qpos()
-        state = {
+        return {
             "tcp_pose": self.agent.tcp.pose.raw_pose,
             "fingers": joints[:, -2:],
             "object_pose": self.object.pose.raw_pose,
             "bin_position": self.bin.pose.p,
             "joint_positions": joints,
             "joint_velocities": self.agent.robot.get_qvel(),
+        } | {
+            name: torch.tensor(value, device=self.device).expand(self.num_envs, -1)
+            for name, value in constants.items()
         }
-        for name, value in constants.items():
-            state[name] = torch.tensor(value, device=self.device).expand(self.num_envs, -1)
-        return state

@@ -111,8 +111,8 @@ def test_a_file_that_is_new_or_gone_is_an_edit(copy):
     assert revisions(DEMOS)["constructskill.demos"] == "1", "of an editor"
     (copy / "demos" / "link.py").symlink_to("nowhere.py")
     assert revisions(DEMOS)["constructskill.demos"] == "1", "a link to nothing"
-    (copy / "demos" / "stance.py").unlink()
-    assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/stance.py")
+    (copy / "demos" / "state.py").unlink()
+    assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/state.py")
 
 
 def test_a_renamed_variable_costs_nothing_once_it_is_recorded(copy):

@@ -23,7 +23,7 @@ from lerobot_constructskill.contract import (
     get_task,
 )
 from lerobot_constructskill.demos.expert import Advice, Expert, ExpertConfig, Phase, PrivilegedState, make_expert
-from lerobot_constructskill.demos.stance import JAW, OPENED, Stance
+from lerobot_constructskill.demos.state import JAW, OPENED
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 
 STATES = 1000
@@ -120,19 +120,17 @@ def test_advice_is_a_pure_function_within_bounds(advised):
 
 def test_the_gripper_closes_on_an_object_alone(advised):
     for state, advice in advised[2]:
-        stance = Stance(state)
         if advice.action[-1] == GRIPPER_CLOSED:
             off = abs((state.object_pose[:3] - state.tcp) @ state.jaw_axis)
-            assert stance.is_held or (advice.phase is Phase.GRASP and off < JAW / 2)
+            assert state.is_held or (advice.phase is Phase.GRASP and off < JAW / 2)
 
 
 def test_an_empty_hand_never_goes_sideways_into_the_object(advised):
     """Beside it and lower than its top, with no finger on its other side, it goes up and nowhere else."""
     seen = 0
     for state, advice in advised[2]:
-        stance = Stance(state)
         around = abs((state.object_pose[:3] - state.tcp) @ state.jaw_axis) < JAW / 2
-        if stance.is_held or advice.phase is Phase.RELEASE or around or state.tcp[2] > stance.top:
+        if state.is_held or advice.phase is Phase.RELEASE or around or state.tcp[2] > state.top:
             continue
         seen += 1
         np.testing.assert_array_equal(advice.action[:2], 0)
@@ -142,8 +140,7 @@ def test_an_empty_hand_never_goes_sideways_into_the_object(advised):
 
 def test_closed_fingers_are_not_put_down_on_the_object(advised):
     for state, advice in advised[2]:
-        stance = Stance(state)
-        if not stance.is_held and min(state.fingers) <= OPENED and state.tcp[2] < stance.top:
+        if not state.is_held and min(state.fingers) <= OPENED and state.tcp[2] < state.top:
             assert advice.action[2] >= 0
 
 

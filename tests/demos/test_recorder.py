@@ -120,17 +120,17 @@ def test_labels_are_what_was_executed_or_is_advised_where_that_is_asked_for():
 
 def test_a_lossless_set_has_every_pixel_as_it_was_rendered_and_the_same_bytes_on_any_number_of_cores(tmp_path):
     config = GenerateConfig("local/exact", str(tmp_path / "set"), episodes=2, video="lossless")
-    summary = record(config)
+    _, attempts = record(config)
     env = ConstructSkillEnv(config.task, episode_length=config.max_steps)
     expert = make_expert(TASKS[config.task], config.expert)
-    attempts = range(DEMO_SEED_START, DEMO_SEED_START + 2 + len(summary.discarded_seeds))
-    seeds = [seed for seed in attempts if seed not in summary.discarded_seeds]
+    assert [attempt.seed for attempt in attempts] == list(range(DEMO_SEED_START, DEMO_SEED_START + len(attempts)))
+    seeds = [attempt.seed for attempt in attempts if attempt.success]
     episodes = [demonstrate(env, expert, config.noise, seed)[0] for seed in seeds]
     env.close()
     dataset, key = LeRobotDataset("local/exact", root=tmp_path / "set"), "observation.images.base"
     facts = json.loads((dataset.root / SIDECAR).read_text())
-    assert (summary.episodes, summary.frames) == (2, dataset.num_frames)
-    assert facts["attempts"] == 2 + len(summary.discarded_seeds)
+    assert (len(seeds), sum(attempt.frames for attempt in attempts if attempt.success)) == (2, dataset.num_frames)
+    assert facts["attempts"] == len(attempts)
     for row, frame in enumerate(frame for frames in episodes for frame in frames):
         seen = (dataset[row][key] * 255).round().permute(1, 2, 0).numpy()
         np.testing.assert_array_equal(seen, frame[key])

@@ -13,7 +13,7 @@ from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER, read_recordings
-from lerobot_constructskill.sim.clipping import LEAST, Clipping
+from lerobot_constructskill.sim.actions import LEAST, Clipping
 
 STEPS = LEAST + 2
 NORMALISED = np.tile(np.float32([0.5, -0.9, 0.4, 1]), (STEPS, 1))
@@ -22,7 +22,7 @@ TASK = "block_to_bin"
 
 @pytest.fixture(autouse=True)
 def nobody_was_told(monkeypatch):
-    monkeypatch.setattr(Clipping, "has_told", False)
+    monkeypatch.setattr(Clipping, "has_warned", False)
 
 
 def of_lerobot(**kwargs):

@@ -10,30 +10,34 @@ import pytest
 import trimesh
 from mani_skill.utils.sapien_utils import look_at
 
-from lerobot_constructskill.sim.poses import looking_from
-from lerobot_constructskill.sim.visuals import in_order
+from lerobot_constructskill.sim.robot import LIGHT_MESHES
+from lerobot_constructskill.sim.visuals import looking_from
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+from light_panda import in_order  # noqa: E402
 
 pytestmark = pytest.mark.sim
 
 NEWER = "AVX2 FMA3 AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR"
 """Instruction sets that NumPy sorts with in ways of their own, where a CPU has them."""
 
-BUILD = "from lerobot_constructskill.sim.visuals import light_panda_urdf; light_panda_urdf()"
 
-
-def build(cache: Path, without: str) -> dict[str, np.ndarray]:
-    """The light robot's triangles, as a process makes them whose NumPy leaves out some instruction sets."""
-    env = os.environ | {"NPY_DISABLE_CPU_FEATURES": without, "XDG_CACHE_HOME": str(cache)}
-    subprocess.run([sys.executable, "-c", BUILD], env=env, check=True, capture_output=True)
-    scenes = {path.name: trimesh.load_scene(path) for path in sorted(cache.rglob("*.glb"))}
+def triangles(folder: Path) -> dict[str, np.ndarray]:
+    """The triangles of each part of the meshes in `folder`."""
+    scenes = {path.name: trimesh.load_scene(path) for path in sorted(folder.glob("*.glb"))}
     return {f"{name}/{key}": part.triangles for name, scene in scenes.items() for key, part in scene.geometry.items()}
 
 
-def test_the_light_robot_does_not_depend_on_instruction_sets(tmp_path):
-    here, elsewhere = build(tmp_path / "here", ""), build(tmp_path / "elsewhere", NEWER)
-    assert here.keys() == elsewhere.keys() and sum(map(len, here.values())) > 1000
-    for part, triangles in here.items():
-        np.testing.assert_array_equal(triangles, elsewhere[part], err_msg=part)
+@pytest.mark.parametrize("without", ["", NEWER])
+def test_the_light_robots_meshes_are_what_its_script_makes_on_any_processor(without, tmp_path):
+    env = os.environ | {"NPY_DISABLE_CPU_FEATURES": without}
+    command = [sys.executable, BENCHMARKS / "light_panda.py", tmp_path]
+    subprocess.run(command, env=env, check=True, capture_output=True)
+    made, shipped = triangles(tmp_path), triangles(LIGHT_MESHES)
+    assert made.keys() == shipped.keys() and sum(map(len, shipped.values())) > 1000
+    for part, expected in shipped.items():
+        np.testing.assert_array_equal(made[part], expected, err_msg=part)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -19,12 +19,12 @@ import lerobot_constructskill.sim.register  # noqa: F401
 from lerobot_constructskill.contract import IMAGE_SIZE, JOINTS, LADDER, SIM_STATE, TASKS
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.sim import gpu_physics, scene
-from lerobot_constructskill.sim.hold import Hold
-from lerobot_constructskill.sim.rendering import best_render_backend
+from lerobot_constructskill.sim import backends, scene
+from lerobot_constructskill.sim.actions import Hold
+from lerobot_constructskill.sim.backends import best_render_backend
 from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
 from lerobot_constructskill.sim.tasks.block import BlockToBinEnv
-from lerobot_constructskill.sim.tasks.brick_on_brick import TOLERANCE
+from lerobot_constructskill.sim.tasks.brick import TOLERANCE
 
 pytestmark = pytest.mark.sim
 
@@ -205,8 +205,8 @@ def test_gpu_physics_that_cannot_be_had_is_refused_in_one_sentence(render_backen
     def enable_gpu():
         raise error
 
-    monkeypatch.setattr(gpu_physics.sapien, "Device", lambda name: name)
-    monkeypatch.setattr(gpu_physics.physx, "enable_gpu", enable_gpu)
+    monkeypatch.setattr(backends.sapien, "Device", lambda name: name)
+    monkeypatch.setattr(backends.physx, "enable_gpu", enable_gpu)
     monkeypatch.setattr(scene, "best_render_backend", lambda: "gpu")
     with pytest.raises(UserError, match=f"^Several environments .* need a GPU.* {said}") as told:
         make("block_to_bin", num_envs=2, render_backend=render_backend)

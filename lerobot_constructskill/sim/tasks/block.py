@@ -1,12 +1,11 @@
 """Concrete block to bin: the extension promise, one asset, four geometry constants and its initial states."""
 
-import numpy as np
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
 
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.sim.scene import PickPlaceEnv
-from lerobot_constructskill.sim.visuals import mottled, textured
+from lerobot_constructskill.sim.visuals import mottled
 
 AERATED_CONCRETE_DENSITY = 600.0
 """kg/m3, autoclaved aerated concrete."""
@@ -34,8 +33,5 @@ class BlockToBinEnv(PickPlaceEnv):
     yaw_range = 0.0
 
     def _load_object(self, builder: ActorBuilder) -> None:
-        half_size = np.array(self.object_size) / 2
-        builder.add_box_collision(half_size=half_size, density=AERATED_CONCRETE_DENSITY)
-        if self.scene.can_render():
-            concrete = textured(mottled((196, 194, 188), contrast=0.08))
-            builder.add_box_visual(half_size=half_size, material=concrete)
+        concrete = mottled((196, 194, 188), contrast=0.08)
+        self._add_box(builder, [0, 0, 0], self.object_size, concrete, AERATED_CONCRETE_DENSITY)

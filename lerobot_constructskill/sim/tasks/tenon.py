@@ -1,14 +1,12 @@
 """Timber joint: the tenon of a post into the mortise of a sill."""
 
 import numpy as np
-import sapien
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs import Actor
 
 from lerobot_constructskill.contract import TASKS
-from lerobot_constructskill.sim.precise import PreciseEnv
-from lerobot_constructskill.sim.visuals import mottled, textured
+from lerobot_constructskill.sim.strict import StrictPlaceEnv
+from lerobot_constructskill.sim.visuals import mottled
 
 POST = (0.06, 0.05, 0.07)
 """Of the post above its tenon, in metres."""
@@ -25,7 +23,7 @@ SPRUCE, LARCH = (205, 164, 110), (150, 96, 56)
 
 
 @register_env(TASKS["tenon_to_mortise"].env_id, max_episode_steps=TASKS["tenon_to_mortise"].horizon)
-class TenonToMortiseEnv(PreciseEnv):
+class TenonToMortiseEnv(StrictPlaceEnv):
     """
     **Task Description:**
     Set a short timber post upright on a sill, its tenon in the mortise, with 4 mm of play.
@@ -34,7 +32,7 @@ class TenonToMortiseEnv(PreciseEnv):
     - The post's centre is uniform within 0.05 m of its nominal place in x and y; its yaw is fixed.
 
     **Success Conditions:**
-    - Those of `PreciseEnv`; the post's shoulders then stand on the sill.
+    - Those of `StrictPlaceEnv`; the post's shoulders then stand on the sill.
     """
 
     object_size = (POST[0], POST[1], POST[2] + TENON[2])
@@ -49,24 +47,17 @@ class TenonToMortiseEnv(PreciseEnv):
 
     def _load_object(self, builder: ActorBuilder) -> None:
         for size, z in ((POST, TENON[2] / 2), (TENON, -POST[2] / 2)):
-            _add_timber(self, builder, [0, 0, z], size, SPRUCE, SPRUCE_DENSITY)
+            self._add_timber(builder, [0, 0, z], size, SPRUCE)
 
-    def _load_bin(self) -> Actor:
-        """A sill of four pieces around the mortise, and one under it; the origin is the mortise's middle."""
+    def _load_bin(self, builder: ActorBuilder) -> None:
+        """A sill of four pieces around the mortise, and one under it."""
         x, y, depth = self.bin_interior
-        builder = self.scene.create_actor_builder()
         floor, below = -depth / 2, SILL[2] - depth
         ends, sides = (SILL[1] - y) / 2, (SILL[0] - x) / 2
-        _add_timber(self, builder, [0, 0, floor - below / 2], [SILL[0], SILL[1], below], LARCH)
+        self._add_timber(builder, [0, 0, floor - below / 2], [SILL[0], SILL[1], below], LARCH)
         for side in (-1, 1):
-            _add_timber(self, builder, [0, side * (y + ends) / 2, 0], [SILL[0], ends, depth], LARCH)
-            _add_timber(self, builder, [side * (x + sides) / 2, 0, 0], [sides, y, depth], LARCH)
-        builder.initial_pose = sapien.Pose(p=self.bin_position)
-        return builder.build_kinematic(name="bin")
+            self._add_timber(builder, [0, side * (y + ends) / 2, 0], [SILL[0], ends, depth], LARCH)
+            self._add_timber(builder, [side * (x + sides) / 2, 0, 0], [sides, y, depth], LARCH)
 
-
-def _add_timber(env: PreciseEnv, builder: ActorBuilder, center, size, colour, density=SPRUCE_DENSITY) -> None:
-    pose, half_size = sapien.Pose(center), np.array(size) / 2
-    builder.add_box_collision(pose, half_size, density=density)
-    if env.scene.can_render():
-        builder.add_box_visual(pose, half_size, material=textured(mottled(colour, contrast=0.06, seed=2)))
+    def _add_timber(self, builder: ActorBuilder, center, size, colour) -> None:
+        self._add_box(builder, center, size, mottled(colour, contrast=0.06, seed=2), SPRUCE_DENSITY)

@@ -4,10 +4,9 @@ import numpy as np
 import sapien
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs import Actor
 
 from lerobot_constructskill.contract import TASKS
-from lerobot_constructskill.sim.precise import PreciseEnv
+from lerobot_constructskill.sim.strict import StrictPlaceEnv
 
 SIDE, THICKNESS = 0.149, 0.010
 """Of the tile in metres: a 595 mm tile at a scale of 1:4, somewhat thicker."""
@@ -28,7 +27,7 @@ WHITE, STEEL, RUBBER = (0.85, 0.85, 0.83), (0.45, 0.47, 0.50), (0.80, 0.35, 0.05
 
 
 @register_env(TASKS["tile_to_grid"].env_id, max_episode_steps=TASKS["tile_to_grid"].horizon)
-class TileToGridEnv(PreciseEnv):
+class TileToGridEnv(StrictPlaceEnv):
     """
     **Task Description:**
     Take a ceiling tile by the lifter that stands on it and lay it into an opening of the grid, with 5 mm of clearance.
@@ -37,7 +36,7 @@ class TileToGridEnv(PreciseEnv):
     - The tile's centre is uniform within 0.05 m of its nominal place in x and y; its yaw is fixed.
 
     **Success Conditions:**
-    - Those of `PreciseEnv`.
+    - Those of `StrictPlaceEnv`.
     """
 
     object_size = (SIDE, SIDE, THICKNESS + HANDLE[2])
@@ -48,14 +47,11 @@ class TileToGridEnv(PreciseEnv):
     def _load_object(self, builder: ActorBuilder) -> None:
         parts = [([SIDE, SIDE, THICKNESS], -HANDLE[2] / 2, WHITE), (HANDLE, THICKNESS / 2, RUBBER)]
         for size, z, colour in parts:
-            half_size, pose = np.array(size) / 2, sapien.Pose([0, 0, z])
-            builder.add_box_collision(pose, half_size, density=MINERAL_FIBRE_DENSITY)
-            builder.add_box_visual(pose, half_size, material=colour)
+            self._add_box(builder, [0, 0, z], size, colour, MINERAL_FIBRE_DENSITY)
 
-    def _load_bin(self) -> Actor:
+    def _load_bin(self, builder: ActorBuilder) -> None:
         """Four T-bars around the opening, on four posts; the origin is the middle of the opening."""
         inner, floor = self.bin_interior[0] / 2, -BAR_HEIGHT / 2
-        builder = self.scene.create_actor_builder()
         for turn in range(4):
             frame = sapien.Pose(q=[np.cos(turn * np.pi / 4), 0, 0, np.sin(turn * np.pi / 4)])
             boxes = [
@@ -64,8 +60,4 @@ class TileToGridEnv(PreciseEnv):
                 ([inner + BAR / 2, inner + BAR / 2, floor - GRID_HEIGHT / 2], [BAR, BAR, GRID_HEIGHT]),
             ]
             for center, size in boxes:
-                pose, half_size = frame * sapien.Pose(center), np.array(size) / 2
-                builder.add_box_collision(pose, half_size)
-                builder.add_box_visual(pose, half_size, material=STEEL)
-        builder.initial_pose = sapien.Pose(p=self.bin_position)
-        return builder.build_kinematic(name="bin")
+                self._add_box(builder, frame * sapien.Pose(center), size, STEEL)

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from lerobot_constructskill.sim.hold import Hold
-from lerobot_constructskill.sim.scene import PLACED_STEPS, PickPlaceEnv
+from lerobot_constructskill.sim.actions import Hold
+from lerobot_constructskill.sim.scene import PickPlaceEnv
 
 UPRIGHT = np.radians(3.0)
 """Largest tilt in radians from the way the object was carried."""
@@ -16,7 +16,7 @@ DEPTH_TOLERANCE = 0.004
 """Largest height in metres above the floor of the receptacle at which an object stands on it."""
 
 
-class PreciseEnv(PickPlaceEnv):
+class StrictPlaceEnv(PickPlaceEnv):
     """
     **Task Description:**
     Pick-and-place into a receptacle that leaves the object little play.
@@ -37,40 +37,24 @@ class PreciseEnv(PickPlaceEnv):
     yaw_tolerance = np.pi / 2
     """Largest angle in radians between the object and the receptacle, which its walls may already see to."""
 
-    def _load_scene(self, options: dict) -> None:
-        super()._load_scene(options)
-        self._fitted = torch.zeros_like(self._placed)
-        self._last_unfit = torch.zeros_like(self._last_unsettled)
-
-    def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        super()._initialize_episode(env_idx, options)
-        self._fitted[env_idx] = False
-        self._last_unfit[env_idx] = 0
-
     @property
     def play(self) -> tuple[float, float]:
         """Largest distance in x and y between the object's and the receptacle's middle, in metres."""
         return tuple((inside - size) / 2 for inside, size in zip(self.bin_interior, self.object_size, strict=True))[:2]
 
-    def fits(self) -> dict[str, torch.Tensor]:
-        """The parts of the strict condition that concern the object, each of shape (num_envs,)."""
+    def evaluate(self) -> dict[str, torch.Tensor]:
         w, x, y, z = self.object.pose.q.unbind(-1)
         tilt = torch.arccos((1 - 2 * (x * x + y * y)).clamp(-1, 1))
         yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         offset = (self.object.pose.p - torch.tensor(self.rest_position, device=self.device)).abs()
         slack = torch.tensor([*self.play, DEPTH_TOLERANCE], device=self.device) + 1e-4  # solver penetration
-        is_still = self.object.linear_velocity.norm(dim=-1) < REST_SPEED
-        return {
+        fits = {
             "is_inside": (offset <= slack).all(dim=-1),
             "is_upright": tilt <= UPRIGHT,
             "is_aligned": torch.sin(yaw).abs() <= np.sin(self.yaw_tolerance),
-            "is_at_rest": is_still,
+            "is_at_rest": self.object.linear_velocity.norm(dim=-1) < REST_SPEED,
         }
-
-    def evaluate(self) -> dict[str, torch.Tensor]:
-        info = super().evaluate() | self.fits()
-        fit = info["is_inside"] & info["is_upright"] & info["is_aligned"] & info["is_at_rest"]
-        fit &= info["is_gripper_open"]
-        self._last_unfit = torch.where(fit, self._last_unfit, self.elapsed_steps)
-        self._fitted |= self.elapsed_steps - self._last_unfit >= PLACED_STEPS
-        return info | {"is_placed_strictly": self._fitted.clone(), "success": self._fitted.clone()}
+        info = super().evaluate() | fits
+        is_fit = torch.stack([info["is_gripper_open"], *fits.values()]).all(dim=0)
+        is_placed_strictly = self._has_lasted("is_placed_strictly", is_fit)
+        return info | {"is_placed_strictly": is_placed_strictly, "success": is_placed_strictly.clone()}

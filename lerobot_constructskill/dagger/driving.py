@@ -1,4 +1,4 @@
-"""Many episodes in lockstep with a learner at the wheel, and the expert beside it, who says what it would do."""
+"""Drives many episodes in lockstep with a learner; the expert labels every state with its own action."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -22,7 +22,7 @@ class Drive:
     """How episodes are driven.
 
     Args:
-        number: the round's, for its frames.
+        number: number of the round, which its frames name.
         beta: probability of the expert's action in a step.
         patience: hopeless steps in a row after which an episode ends; they are dropped.
         pictures: whether frames keep what the cameras saw, a megabyte every three steps.
@@ -36,7 +36,7 @@ class Drive:
 
 @dataclass
 class Episode:
-    """One of a round: its frames, in the columns of `columns.dagger_features`, and whether the object was placed."""
+    """An episode of a round: its frames, in the columns of `columns.dagger_features`, and how it went."""
 
     seed: int
     now: Step
@@ -46,9 +46,10 @@ class Episode:
     hopeless: int = 0
 
     def choose(self, advice: Advice, proposed: np.ndarray, drive: Drive) -> np.ndarray:
-        """The action of this step; the frame that it makes is kept with its label."""
+        """Return the action of this step, and keep the step's frame with the expert's label."""
         expert = self.rng.random() < drive.beta
-        executed = advice.action if expert else as_executed(proposed)
+        within_bounds = np.clip(np.asarray(proposed, dtype=np.float32), *action_bounds(len(proposed)))
+        executed = advice.action if expert else within_bounds
         self.hopeless = self.hopeless + 1 if advice.hopeless else 0
         self.frames.append(
             seen(self.now.seen["pixels"] if drive.pictures else {}, self.now.agent_state, self.now.sim)
@@ -62,7 +63,7 @@ class Episode:
         return executed
 
     def add(self, step: Step, drive: Drive) -> bool:
-        """Keep what came of the step, and return whether the episode is over."""
+        """Complete the step's frame with its outcome, and return whether the episode is over."""
         self.now, self.placed = step, self.placed or step.info["is_success"]
         self.frames[-1] |= came_of_it(step.reward, step.info["is_success"], step.done)
         if self.hopeless < drive.patience:
@@ -71,11 +72,6 @@ class Episode:
         if self.frames:
             self.frames[-1]["next.done"] = np.array([True])
         return True
-
-
-def as_executed(action: np.ndarray) -> np.ndarray:
-    """What the environment makes of an action: within its bounds."""
-    return np.clip(np.asarray(action, dtype=np.float32), *action_bounds(len(action)))
 
 
 def drive_all(
@@ -87,7 +83,7 @@ def drive_all(
     together: int,
     n_workers: int | None = None,
 ) -> Iterator[Episode]:
-    """Yield an episode of each seed as soon as it is over; what it holds does not depend on those beside it.
+    """Yield an episode of each seed as soon as it is over. No episode depends on those beside it.
 
     Args:
         together: episodes at a time, each with a copy of the learner.
@@ -117,12 +113,11 @@ def drive_all(
 
 
 def copies(learner: Agent, count: int) -> list[Agent]:
-    """Agents that act alike and remember on their own; policies share their weights."""
-    if not isinstance(learner, PolicyAgent):
-        return [learner, *(deepcopy(learner) for _ in range(count - 1))]
-    shared = {id(child): child for child in learner.policy.children()}
-    policies = [learner.policy, *(deepcopy(learner.policy, dict(shared)) for _ in range(count - 1))]
-    return [PolicyAgent(policy, learner.preprocessor, learner.postprocessor) for policy in policies]
+    """Agents that act alike, each with a memory of its own; policies share their weights and processors."""
+    shared = []
+    if isinstance(learner, PolicyAgent):
+        shared = [*learner.policy.children(), learner.preprocessor, learner.postprocessor]
+    return [learner, *(deepcopy(learner, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 
 def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, Episode]:

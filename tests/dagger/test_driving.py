@@ -1,4 +1,4 @@
-"""Episodes with a learner at the wheel: who acts, whose label is kept, and that nobody beside them matters.
+"""Episodes that a learner drives: who acts, whose label is kept, and that no episode depends on those beside it.
 
 The simulator is the toy of the data sets' tests; driving, advice and columns are the real ones.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_constructskill.contract import SIM_STATE, get_task
-from lerobot_constructskill.dagger import wheel
+from lerobot_constructskill.dagger import driving
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import EXPERT, LEARNER, dagger_features
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
@@ -51,7 +51,7 @@ def toys(monkeypatch):
     def toy_simulators(env_kwargs, n_workers=None):
         yield InThisProcess(env_kwargs)
 
-    monkeypatch.setattr(wheel, "simulators", toy_simulators)
+    monkeypatch.setattr(driving, "simulators", toy_simulators)
 
 
 class Wanderer:
@@ -65,8 +65,8 @@ class Wanderer:
 
 
 def drive(beta, together=2, patience=20, expert=EXPERTS, **how):
-    settings = wheel.Drive(number=1, beta=beta, patience=patience, **how)
-    episodes = wheel.drive_all(Wanderer(), expert, ENV, SEEDS, settings, together)
+    settings = driving.Drive(number=1, beta=beta, patience=patience, **how)
+    episodes = driving.drive_all(Wanderer(), expert, ENV, SEEDS, settings, together)
     return {episode.seed: episode for episode in episodes}
 
 
