@@ -121,7 +121,8 @@ def test_an_installed_copy_finds_its_configurations_from_an_empty_folder(built: 
     installed, elsewhere = tmp_path / "installed", tmp_path / "elsewhere"
     zipfile.ZipFile(next(built.glob("*.whl"))).extractall(installed)
     elsewhere.mkdir()
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.config"]
+    code = "from lerobot_constructskill.scripts.config import show_or_write; show_or_write.main()"
+    command = [sys.executable, "-c", code]
     surroundings = os.environ | {"PYTHONPATH": str(installed)}
     done = subprocess.run(command, env=surroundings, cwd=elsewhere, capture_output=True, text=True)
     assert done.stdout.rstrip() == show(), done.stderr

@@ -6,10 +6,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from itertools import takewhile
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, get_type_hints
 
 from lerobot_constructskill.errors import (
     InputError,
@@ -56,6 +56,21 @@ def run[Config](
         told = f"Instead of --config_path, the first argument can be a file or a name: {shipped}. "
         flags = _put_names(sys.argv[1:], ("config_path",) if presets else first, presets)
         say(action(parse(config_class, flags, epilog=(told if presets else "") + EPILOG)))
+
+
+def command[Config](
+    presets: str | None = None, first: Sequence[str] = ()
+) -> Callable[[Callable[[Config], str]], Callable[[Config], str]]:
+    """Give a function that takes a configuration, its argument `config`, a `main` that is its console command.
+
+    `presets` and `first` are those of `run`.
+    """
+
+    def with_main(action: Callable[[Config], str]) -> Callable[[Config], str]:
+        action.main = partial(run, get_type_hints(action)["config"], action, presets, first)
+        return action
+
+    return with_main
 
 
 def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> list[str]:

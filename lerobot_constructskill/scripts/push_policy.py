@@ -10,7 +10,7 @@ from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_ta
 from lerobot_constructskill.dataset.card import render_template
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 PUSHED = ["*.safetensors", "*.json"]
 """Files of a checkpoint that leave the machine: weights, configurations and processors."""
@@ -27,6 +27,7 @@ class PushPolicyConfig(Checked):
     private: bool = False  # whether only its owner sees it
 
 
+@command()
 def push_policy(config: PushPolicyConfig) -> str:
     """Push and return the name.
 
@@ -102,7 +103,3 @@ def render_card(
         policy=policy,
         encoder=encoder,
     )
-
-
-def main() -> None:
-    run(PushPolicyConfig, push_policy)
