@@ -81,13 +81,8 @@ def locate(repo_id: str | None, root: Path | None = None, revision: str | None =
     return Path(folder)
 
 
-def open_lerobot(
-    repo_id: str, root: Path | None, revision: str | None = None, video_backend: str | None = None
-) -> "LeRobotDataset":
+def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
     """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
-
-    Args:
-        video_backend: LeRobot's decoder; its default is torchcodec where that is installed.
 
     Raises:
         FileNotFoundError: there is no data set in `root`.
@@ -100,7 +95,7 @@ def open_lerobot(
         read_info(root)
     try:
         with one_sentence(repo_id, revision):
-            dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
+            dataset = LeRobotDataset(repo_id, root=root, revision=revision)
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
         if root is None and isinstance(error, UserError | OSError):
             raise
