@@ -1,40 +1,26 @@
-"""Progress bars: on a terminal their clocks move every second, in a log they print few lines."""
+"""Progress bars, which print few lines in a log."""
 
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from io import StringIO
-from threading import Event, Thread
 
 from tqdm import tqdm
 
-TICK_S, LOG_INTERVAL_S = 1, 5
+LOG_INTERVAL_S = 5
+"""Seconds between two lines of a bar where standard error is no terminal."""
 
 
 class Progress(tqdm):
-    """A `tqdm` whose clock moves during long pieces of work; a bar inside another disappears when it has finished.
+    """A `tqdm` that shows every piece of work, on a terminal at most ten times a second; in a log it prints few lines.
 
     The remaining time is estimated from the average of all pieces so far. Pieces take from milliseconds to minutes and
     come in bursts, one from each worker, so that an average of the last few would jump.
     """
 
     def __init__(self, *args, smoothing: float = 0, leave: bool | None = None, **options):
-        self._closed = Event()
-        self._clock = Thread(target=self._tick, daemon=True)
         interval = 0.1 if sys.stderr.isatty() else LOG_INTERVAL_S
         super().__init__(*args, smoothing=smoothing, leave=leave, miniters=1, mininterval=interval, **options)
-        if sys.stderr.isatty():
-            self._clock.start()
-
-    def close(self) -> None:
-        self._closed.set()
-        if self._clock.is_alive():
-            self._clock.join()
-        super().close()
-
-    def _tick(self) -> None:
-        while not self._closed.wait(TICK_S):
-            self.refresh()
 
 
 @contextmanager
