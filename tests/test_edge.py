@@ -131,7 +131,7 @@ def test_a_bad_value_is_a_sentence_or_valid(command: str, field: str, tmp_path, 
     for value in BAD:
         made = outcome(config_class, [*flags(command, config_class), f"--{field}={value}"])
         if isinstance(made, Exception):
-            status, said = console._judge(made)
+            status, said = console._status_and_sentence(made)
             assert status == console.REFUSED, f"{field}={value!r}: {type(made).__name__}: {said}"
             assert said and "\n" not in said
         else:

@@ -76,14 +76,13 @@ def test_plugin_registers_without_simulator_or_model() -> None:
 
 
 HELP = """
-import contextlib, importlib, io, os, sys
+import contextlib, importlib.metadata, io, os, sys
 for command, target in {scripts}.items():
-    module, function = target.split(":")
     os.environ.pop("OMP_WAIT_POLICY", None)
     sys.argv = [command, "--help"]
     with contextlib.redirect_stdout(io.StringIO()) as help:
         try:
-            getattr(importlib.import_module(module), function)()
+            importlib.metadata.EntryPoint(command, target, "console_scripts").load()()
         except SystemExit as exit:
             assert not exit.code, f"{{command}} --help ends with {{exit.code}}"
     assert f"usage: {{command}}" in help.getvalue(), f"{{command}} --help prints no help"

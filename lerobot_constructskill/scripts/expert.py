@@ -12,7 +12,7 @@ from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.parsing import tells_of_bases
+from lerobot_constructskill.parsing import with_fields_of_bases
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.scripts.console import command
 
@@ -20,7 +20,7 @@ REQUIRED = 0.95
 """Share of random initial states in which an expert must succeed."""
 
 
-@tells_of_bases
+@with_fields_of_bases
 @dataclass(frozen=True)
 class NoNoise(NoiseConfig):
     """`NoiseConfig` for commands that add no noise by default; draccus takes no default from a field's value.

@@ -12,7 +12,7 @@ from lerobot_constructskill.artifacts.digests import data_sha256, file_sha256
 from lerobot_constructskill.artifacts.folders import replaced, write_text
 from lerobot_constructskill.bounds import BatchSize, Checked, Device, Episodes, NotEmpty, RepoId, Seed, Text
 from lerobot_constructskill.dataset.dataset import read_provenance
-from lerobot_constructskill.dataset.hub import choose_held_out, one_sentence, open_lerobot
+from lerobot_constructskill.dataset.hub import choose_held_out, hub_errors, open_lerobot
 from lerobot_constructskill.demos.settings import GenerateConfig, generator_facts
 from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG, TRAINED
@@ -162,7 +162,7 @@ def fit_noise(config: FitNoiseConfig) -> str:
     dataset = open_lerobot(config.repo_id, config.root, config.revision)
     generator = generator_facts(decode(GenerateConfig, read_provenance(dataset.root)["generator"]))
     episodes = _by_the_expert(dataset, choose_held_out(dataset, config.episodes, [config.policy_path]))
-    with one_sentence(config.policy_path):
+    with hub_errors(config.policy_path):
         precision = config.backbone_precision
         agent = PolicyAgent.from_pretrained(config.policy_path, config.device, backbone_precision=precision)
     offline.check_actions(agent.policy, dataset)

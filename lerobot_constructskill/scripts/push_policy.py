@@ -41,7 +41,7 @@ def push_policy(config: PushPolicyConfig) -> str:
     """
     from huggingface_hub import HfApi
 
-    from lerobot_constructskill.dataset.hub import check_private, one_sentence
+    from lerobot_constructskill.dataset.hub import check_private, hub_errors
 
     for name in (TRAIN_CONFIG, "config.json"):
         if not (config.policy_path / name).is_file():
@@ -51,7 +51,7 @@ def push_policy(config: PushPolicyConfig) -> str:
     encoder = OBJECT.read(record) if record.is_file() else {}
     outcomes, task = seed_outcomes(config.evaluations), get_task(config.task).name
     card, api = render_card(config.repo_id, outcomes, task, train, policy, encoder), HfApi()
-    with one_sentence(config.repo_id):
+    with hub_errors(config.repo_id):
         api.create_repo(config.repo_id, private=config.private, exist_ok=True)
         if config.private:
             check_private(config.repo_id)
