@@ -32,13 +32,16 @@ class NoNoise(NoiseConfig):
     sigma: Sigma = 0.0
 
 
+View = Annotated[str, Among(("close", "policy"))]
+
+
 @dataclass
 class FilmConfig(Checked):
     """Film the scripted expert of a task in one episode, by default without noise."""
 
     task: str = "brick_to_bin"  # a name in `contract.TASKS`
     out: Path | None = None  # the video; default: outputs/<task>.mp4
-    view: Annotated[str, Among(("close", "policy"))] = "close"  # a close-up, or what the policy sees
+    view: View = "close"  # a close-up (close), or what the policy sees (policy)
     seed: Seed = DEMO_SEED_START  # decides the initial state and the noise
     noise: NoNoise = field(default_factory=NoNoise)
     perturb: str = ""  # axis=level, separated by commas, as in the environment

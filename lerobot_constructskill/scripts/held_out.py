@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
 
+Patterns = Annotated[list[Text], NotEmpty()]
+
+
 @dataclass(kw_only=True)
 class HeldOutConfig(Checked):
     """The held-out demonstrations, and how a policy is loaded that predicts their actions."""
@@ -41,9 +44,7 @@ class HeldOutConfig(Checked):
 class OfflineConfig(HeldOutConfig):
     """Print and write a table of translation errors in metres, gripper accuracy and chunk consistency."""
 
-    policies: Annotated[
-        list[Text], NotEmpty()
-    ]  # pretrained_model folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
+    policies: Patterns  # `pretrained_model` folders; patterns such as outputs/fast/train/*/*/last/pretrained_model
     out: Path = Path("outputs/offline")  # folder for offline.json and offline.parquet
     batch_size: BatchSize = 32  # frames at a time
     seed: Seed = 0  # of policies that sample their actions
