@@ -11,7 +11,7 @@ import torch
 from run import machine
 
 from lerobot_constructskill.contract import SHIPPED
-from lerobot_constructskill.scripts.check_task import CheckTaskConfig, measure_expert
+from lerobot_constructskill.scripts.expert import CheckTaskConfig, measure_expert
 
 FILE = Path(__file__).with_suffix(".json")
 

@@ -1,13 +1,13 @@
 """ConstructSkill for LeRobot. A room imports only from rooms below it (`tests/test_architecture.py` holds them to it).
 
-scripts     console commands, one file each
+scripts     console commands
 board       submissions, their replay, the leaderboard
 comparison  two sides judged over training seeds
 analysis    rows in, page out: statistics and report
 study       runs, made where they are missing
 dagger      rounds that a policy drives and the expert labels
 rollout     agents in lockstep, references, simulators, errors offline
-dataset     what one does with a data set that is there
+dataset     reads a finished data set: checks, card, plots, Hub
 demos       experts, noise, recorder
 training    how any LeRobot policy is trained and validated in a study
 features    a data set through an encoder, once; frozen_vit's trainer

@@ -65,14 +65,11 @@ class MachineError(UserError, OSError):
 def remedy_of(error: ModuleNotFoundError) -> str | None:
     """How to install a package that one of our extras brings; None for any other package."""
     wanted = (error.name or "").partition(".")[0]
-    try:
-        requirements = requires(DISTRIBUTION) or []
-    except PackageNotFoundError:
-        requirements = []
-    for requirement in requirements:
-        package, extra = re.match(r"[\w.-]+", requirement)[0], re.search(r"extra == [\"']([\w-]+)", requirement)
-        if extra and package.replace("-", "_") == wanted:
-            return f"{wanted} is not installed; pip install '{DISTRIBUTION}[{extra[1]}]'."
+    with suppress(PackageNotFoundError):
+        for requirement in requires(DISTRIBUTION) or ():
+            package, extra = re.match(r"[\w.-]+", requirement)[0], re.search(r"extra == [\"']([\w-]+)", requirement)
+            if extra and package.replace("-", "_") == wanted:
+                return f"{wanted} is not installed; pip install '{DISTRIBUTION}[{extra[1]}]'."
     return None
 
 
@@ -87,7 +84,7 @@ def first_line(error: Exception) -> str:
 
 
 @contextmanager
-def heard_by_lerobot() -> Iterator[None]:
+def as_field_error() -> Iterator[None]:
     """Re-raise an `InputError` as a `FieldError`, whose sentence LeRobot's commands print."""
     try:
         yield
@@ -131,7 +128,7 @@ def keep_traceback(command: Sequence[str], told: str) -> Path | None:
     return None
 
 
-def end_lerobots_commands_in_one_sentence() -> None:
+def print_user_errors_of_lerobot() -> None:
     """Make LeRobot's commands print a `UserError` as one sentence and keep its traceback in a log, as ours do.
 
     Other exceptions and other programs stay as they are.

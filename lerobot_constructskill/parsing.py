@@ -135,7 +135,7 @@ def read_fields(path: Path) -> dict[str, Any]:
     return (JSON if path.suffix == ".json" else YAML).read(path)
 
 
-def tells_of_bases[Config](config_class: type[Config]) -> type[Config]:
+def with_fields_of_bases[Config](config_class: type[Config]) -> type[Config]:
     """Decorate a configuration so that its `--help` tells of the fields of its bases too, which draccus leaves out."""
     told = [(base.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0] for base in config_class.__bases__]
     config_class.__doc__ = "\n".join([(config_class.__doc__ or "").rstrip(), *filter(None, map(str.rstrip, told)), ""])

@@ -17,7 +17,7 @@ from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoPro
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.scripts.config import ConfigConfig, write
-from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
+from lerobot_constructskill.scripts.held_out import OfflineConfig, evaluate_offline
 
 pytestmark = [pytest.mark.sim, pytest.mark.nightly]
 
@@ -128,7 +128,9 @@ def test_a_policy_is_evaluated_offline(trained, demonstrations):
     kind, checkpoint = trained
     root = Path(demonstrations[0].split("=")[1])
     out = checkpoint.parent / "offline"
-    evaluate_offline(OfflineConfig([str(checkpoint)], "local/demos", root, episodes=[1], out=out))
+    evaluate_offline(
+        OfflineConfig(policies=[str(checkpoint)], repo_id="local/demos", root=root, episodes=[1], out=out)
+    )
     (row,) = json.loads((out / "offline.json").read_text())
     assert (row["policy"], row["training_seed"]) == (kind, 1000)
     assert 0.001 < row["mean_m"] <= row["rmse_m"] < 0.3 and 0 < row["consistency_m"] < 0.3

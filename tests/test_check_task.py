@@ -3,7 +3,7 @@
 import pytest
 
 from lerobot_constructskill.demos.expert import ExpertConfig
-from lerobot_constructskill.scripts.check_task import CheckTaskConfig, check_task
+from lerobot_constructskill.scripts.expert import CheckTaskConfig, check_task
 
 
 @pytest.mark.parametrize("bad", [{"task": "lintel"}, {"task": "brick_to_bin", "states": 0}])

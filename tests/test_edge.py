@@ -1,12 +1,13 @@
 """Every field of every console command, by introspection, with values that break things: a sentence, or valid."""
 
-import importlib
 import json
 import math
+import sys
 import tomllib
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from functools import cache
+from functools import cache, partial
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -19,7 +20,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts import console
-from lerobot_constructskill.scripts.film import FilmConfig
+from lerobot_constructskill.scripts.expert import FilmConfig
 
 SCRIPTS = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
 BARE = {"constructskill-doctor"}
@@ -59,12 +60,16 @@ def config_classes() -> dict[str, type]:
     for command, entry in SCRIPTS.items():
         if command in BARE:
             continue
-        module = importlib.import_module(entry.split(":")[0])
+        main = EntryPoint(command, entry, "console_scripts").load()
+        if isinstance(main, partial):  # of `console.command`
+            found[command] = main.args[0]
+            continue
+        module = sys.modules[main.__module__]
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(
                 module, "run", lambda config_class, *_, name=command, **__: found.update({name: config_class})
             )
-            module.main()
+            main()
     return found
 
 
@@ -126,7 +131,7 @@ def test_a_bad_value_is_a_sentence_or_valid(command: str, field: str, tmp_path, 
     for value in BAD:
         made = outcome(config_class, [*flags(command, config_class), f"--{field}={value}"])
         if isinstance(made, Exception):
-            status, said = console._judge(made)
+            status, said = console._status_and_sentence(made)
             assert status == console.REFUSED, f"{field}={value!r}: {type(made).__name__}: {said}"
             assert said and "\n" not in said
         else:

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import tomllib
 from collections.abc import Callable, Iterator
-from importlib import import_module
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -22,8 +22,8 @@ from lerobot_constructskill.errors import (
     MissingError,
     TakenError,
     UserError,
+    as_field_error,
     full_traceback,
-    heard_by_lerobot,
     remedy_of,
 )
 
@@ -44,16 +44,15 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
             assert "--debug" not in sys.argv
             raise error
 
-        name, function = SCRIPTS[command].split(":")
-        module = import_module(name)
+        main = EntryPoint(command, SCRIPTS[command], "console_scripts").load()
         with monkeypatch.context() as patch:
             patch.setattr(tempfile, "tempdir", str(tmp_path))
             patch.setenv("XDG_STATE_HOME", str(state))
             if error is not None:
                 patch.setattr(parsing, "parse", broken)
                 if command == "constructskill-doctor":  # it has no configuration to parse
-                    patch.setattr(module, "diagnose", broken)
-            status, _, said = call_inside(getattr(module, function), command, *flags)
+                    patch.setattr(sys.modules[main.__module__], "diagnose", broken)
+            status, _, said = call_inside(main, command, *flags)
         return status, said
 
     return call
@@ -224,7 +223,7 @@ def test_an_environment_without_its_simulator_says_what_to_install() -> None:
 
 
 def test_what_lerobot_parses_is_refused_by_no_value_error() -> None:
-    with pytest.raises(FieldError, match="a sentence") as refusal, heard_by_lerobot():
+    with pytest.raises(FieldError, match="a sentence") as refusal, as_field_error():
         raise InputError("a sentence.")
     assert not isinstance(refusal.value, ValueError)
 

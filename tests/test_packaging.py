@@ -76,14 +76,13 @@ def test_plugin_registers_without_simulator_or_model() -> None:
 
 
 HELP = """
-import contextlib, importlib, io, os, sys
+import contextlib, importlib.metadata, io, os, sys
 for command, target in {scripts}.items():
-    module, function = target.split(":")
     os.environ.pop("OMP_WAIT_POLICY", None)
     sys.argv = [command, "--help"]
     with contextlib.redirect_stdout(io.StringIO()) as help:
         try:
-            getattr(importlib.import_module(module), function)()
+            importlib.metadata.EntryPoint(command, target, "console_scripts").load()()
         except SystemExit as exit:
             assert not exit.code, f"{{command}} --help ends with {{exit.code}}"
     assert f"usage: {{command}}" in help.getvalue(), f"{{command}} --help prints no help"
@@ -121,7 +120,8 @@ def test_an_installed_copy_finds_its_configurations_from_an_empty_folder(built: 
     installed, elsewhere = tmp_path / "installed", tmp_path / "elsewhere"
     zipfile.ZipFile(next(built.glob("*.whl"))).extractall(installed)
     elsewhere.mkdir()
-    command = [sys.executable, "-m", "lerobot_constructskill.scripts.config"]
+    code = "from lerobot_constructskill.scripts.config import show_or_write; show_or_write.main()"
+    command = [sys.executable, "-c", code]
     surroundings = os.environ | {"PYTHONPATH": str(installed)}
     done = subprocess.run(command, env=surroundings, cwd=elsewhere, capture_output=True, text=True)
     assert done.stdout.rstrip() == show(), done.stderr

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Callable
 from importlib import import_module
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -75,8 +76,7 @@ def configured(call: str, folder: Path) -> str:
 
 
 def entry_point(name: str) -> Callable[[], None]:
-    module, _, function = OURS[name].partition(":")
-    return getattr(import_module(module), function)
+    return EntryPoint(name, OURS[name], "console_scripts").load()
 
 
 @pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in OURS])

@@ -18,8 +18,7 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse
-from lerobot_constructskill.scripts.fit_noise import FitNoiseConfig, fit_noise
-from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
+from lerobot_constructskill.scripts.held_out import FitNoiseConfig, OfflineConfig, evaluate_offline, fit_noise
 from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, study
 from lerobot_constructskill.scripts.submit import SubmitConfig, submit
@@ -135,14 +134,13 @@ def test_lerobot_evaluates_its_checkpoint(checkpoint, tmp_path, monkeypatch):
 
 
 def read_offline(checkpoint: Path, demonstrations: Path, out: Path) -> None:
-    asked = OfflineConfig([str(checkpoint)], "local/mine", demonstrations, episodes=[1], out=out)
+    asked = OfflineConfig(policies=[str(checkpoint)], repo_id="local/mine", root=demonstrations, episodes=[1], out=out)
     assert TYPE in evaluate_offline(asked)
 
 
 def read_to_fit_noise(checkpoint: Path, demonstrations: Path, out: Path) -> None:
-    assert "Noise of" in fit_noise(
-        FitNoiseConfig(str(checkpoint), "local/mine", out / "dart.yaml", demonstrations, episodes=[1])
-    )
+    named = {"policy_path": str(checkpoint), "repo_id": "local/mine", "root": demonstrations}
+    assert "Noise of" in fit_noise(FitNoiseConfig(**named, out=out / "dart.yaml", episodes=[1]))
 
 
 def read_to_drive(checkpoint: Path, demonstrations: Path, out: Path) -> None:

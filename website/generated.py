@@ -6,7 +6,7 @@ import sys
 import tomllib
 from collections import defaultdict
 from contextlib import redirect_stdout, suppress
-from importlib import import_module
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
@@ -105,15 +105,14 @@ def policies(root: Path) -> dict[str, list[str]]:
 
 
 def commands(scripts: dict[str, str]) -> str:
-    """The help of every command but `constructskill`, which starts the others."""
-    head = "# Commands\n\n`constructskill` lists all commands, and `constructskill film` is `constructskill-film`."
-    texts = [f"## {name}\n\n```text\n{help_of(name, scripts[name])}```" for name in sorted(scripts) if "-" in name]
-    return "\n\n".join([head, *texts])
+    """The help of every command."""
+    texts = [f"## {name}\n\n```text\n{help_of(name, scripts[name])}```" for name in sorted(scripts)]
+    return "\n\n".join(["# Commands", *texts])
 
 
 def help_of(name: str, target: str) -> str:
     """The text that a command prints for `--help`."""
-    main, printed = import_module(target.partition(":")[0]).main, io.StringIO()
+    main, printed = EntryPoint(name, target, "console_scripts").load(), io.StringIO()
     with (
         redirect_stdout(printed),
         suppress(SystemExit),

@@ -1,6 +1,6 @@
 """Reads Parquet files whose columns are the fields of a dataclass."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -28,14 +28,12 @@ class Parquet:
         what: what such a file is called, with its article.
         kind: the dataclass.
         types: Arrow's type of each annotation that is no str, int, float or bool.
-        later: columns that earlier versions did not have; they are read as null.
         json: columns that hold JSON.
     """
 
     what: str
     kind: type
     types: Mapping[Any, pa.DataType] = field(default_factory=dict)
-    later: Sequence[str] = ()
     json: Mapping[str, Json] = field(default_factory=dict)
 
     @cached_property
@@ -54,9 +52,6 @@ class Parquet:
             InputError: it is of another kind, or a value is missing.
         """
         table = read_parquet(path, most=MOST)
-        for index, one in enumerate(self.schema):
-            if one.name in self.later and one.name not in table.column_names:
-                table = table.add_column(min(index, table.num_columns), one, pa.nulls(len(table), one.type))
         if not table.schema.equals(self.schema):
             raise InputError(f"'{path}' is not {self.what} of this version.")
         if not len(table):

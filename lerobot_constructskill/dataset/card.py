@@ -3,27 +3,18 @@
 import json
 import re
 from importlib.resources import files
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_fields
+from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
-from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.dataset.dataset import DataSet, Provenance
 from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
+from lerobot_constructskill.demos.settings import generator_facts
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.interface import describe_task
-
-Version = Annotated[
-    str,
-    Pattern(
-        r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}(?:, edited: [\w./, -]{1,999})?|[\w.+!-]{1,64}",
-        "a version",
-    ),
-]
-"""The version of a package, or what `artifacts/code.py` says of one whose source is hashed."""
-
 
 MEANINGS = {
     "observation.state": "end effector's position (m) and axis-angle (rad) in the robot's base frame; the fingers (m)",
@@ -62,23 +53,13 @@ TURNS = "; turns in rad about the same axes, right-handed"
 """What follows the meaning of an action in a task that turns."""
 
 
-class SidecarFields:
-    """The fields of `meta/constructskill.json` that cards and checks read, beside the configuration."""
-
-    attempts: Count
-    discarded_seeds: list[Seed]
-    versions: dict[Word, Version]
-    noise_covariance: list[list[float]]
-    sha256: dict[str, str]
-
-
 def card_facts(data: DataSet) -> dict[str, Any]:
     """The facts of a card as plain values, which can be kept in JSON and compared with the data later.
 
     Raises:
         InputError: a field of the data set's metadata has an impossible value.
     """
-    check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
+    check_fields(Provenance, data.facts, f"{SIDECAR}: ")
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:
@@ -90,7 +71,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     learners = {"dagger": data.facts["dagger"]} if "dagger" in data.facts else {}
     return learners | {
         "repo_id": data.config.repo_id,
-        "generator": data.facts["generator"],
+        "generator": generator_facts(data.config),
         "noise_covariance": data.facts["noise_covariance"],
         "versions": data.facts["versions"],
         "attempts": data.facts["attempts"],

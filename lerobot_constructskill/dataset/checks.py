@@ -3,6 +3,7 @@
 `CHECKS` names the checks. Noise is not judged by its spread alone: it is a function of the seed, so it is drawn again.
 """
 
+import json
 import operator
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -21,8 +22,7 @@ from lerobot_constructskill.contract import (
     SIM_STATE,
     get_task,
 )
-from lerobot_constructskill.dataset.card import SidecarFields
-from lerobot_constructskill.dataset.dataset import DataSet
+from lerobot_constructskill.dataset.dataset import DataSet, Provenance
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
 from lerobot_constructskill.demos.columns import ACTORS, EXPERT, SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
@@ -61,23 +61,23 @@ def check_files(data: DataSet) -> Iterator[str]:
 
 def check_schema(data: DataSet) -> Iterator[str]:
     try:
-        check_fields(SidecarFields, data.facts, f"{SIDECAR}: ")
+        check_fields(Provenance, data.facts, f"{SIDECAR}: ")
     except InputError as error:
         yield str(error)
-    task, features, wanted = get_task(data.config.task), data.info["features"], data.columns
+    task, features, wanted = get_task(data.config.task), data.info["features"], json.loads(json.dumps(data.columns))
     yield from (f"info.json has no feature {name}." for name in sorted(wanted.keys() - features.keys()))
     for name in sorted(features.keys() - wanted.keys() - BOOKKEEPING):
         yield f"info.json has the feature {name}, which is not of the contract and which a policy may read."
     for name in wanted.keys() & features.keys():
         for part in ("dtype", "shape", "names"):
-            if _plain(features[name][part]) != _plain(wanted[name][part]):
-                yield f"{name} has {part} {features[name][part]}, not {wanted[name][part]}."
+            if features[name].get(part) != wanted[name][part]:
+                yield f"{name} has {part} {features[name].get(part)}, not {wanted[name][part]}."
     stored = {name for name, feature in wanted.items() if feature["dtype"] != "video"} | BOOKKEEPING
     for name in sorted(stored ^ set(data.rows.columns)):
         yield f"data/ {'has no' if name in stored else 'has an unknown'} column {name}."
     yield from _found(
         {
-            f"info.json says {data.info['fps']} frames a second, not {FPS}.": data.info["fps"] != FPS,
+            f"info.json says {data.info.get('fps')} frames a second, not {FPS}.": data.info.get("fps") != FPS,
             f"The instruction is {data.tasks}, not '{task.instruction}'.": data.tasks != [task.instruction],
         }
     )
@@ -263,7 +263,7 @@ def check_provenance(data: DataSet) -> Iterator[str]:
             "The episodes are not in the order of their seeds.": seeds != sorted(seeds),
             f"noise_covariance is {told}; of the settings it is {drawn.tolist()}.": not _is_close(told, drawn),
             f"The versions of {missing} are not recorded.": missing,
-            "Whether the light robot was drawn is not recorded.": data.facts["generator"]["light_robot"] is None,
+            "Whether the light robot was drawn is not recorded.": data.config.light_robot is None,
             f"{MODALITY} is missing.": not (data.root / MODALITY).is_file(),
         }
     )
@@ -313,10 +313,6 @@ def _is_close(found, value: np.ndarray) -> bool:
     except (TypeError, ValueError):
         return False
     return numbers.shape == value.shape and np.allclose(numbers, value, rtol=1e-4, atol=1e-6)
-
-
-def _plain(value):
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _few(values) -> str:

@@ -5,15 +5,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 import pandas as pd
 
+from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
 from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
-    MADE,
     SIDECAR,
     as_before_joints,
     dagger_features,
@@ -25,7 +25,6 @@ from lerobot_constructskill.files import Json, read_parquet
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO
 from lerobot_constructskill.parsing import decode
 
-OBJECT = Json("a JSON object")
 STATISTICS = Json("statistics of columns", dict[str, dict[str, Any]])
 
 EPISODE_COLUMNS = "episode_index", "length", "dataset_from_index", "dataset_to_index"
@@ -43,23 +42,36 @@ NUMBERS = {"float32": "f", "float64": "f", "int64": "i", "int32": "i", "bool": "
 """A column's `dtype` to NumPy's kind; a missing value turns a column of whole numbers into floats."""
 
 
-class Facts(dict):
-    """A JSON object of a data set. A missing field is an `InputError`, because the file is wrong and not our code.
+Version = Annotated[
+    str,
+    Pattern(
+        r"(?:[\w.+!-]{1,64}, )?source [0-9a-f]{12}(?:, edited: [\w./, -]{1,999})?|[\w.+!-]{1,64}",
+        "a version",
+    ),
+]
+"""The version of a package, or what `artifacts/code.py` says of one whose source is hashed."""
 
-    Args:
-        file: the file that it is from.
-        fields: its names and values.
-    """
 
-    def __init__(self, file: str, fields: dict[str, Any]):
-        super().__init__(fields)
-        self.file = file
-        for name, value in fields.items():
-            if isinstance(value, dict):
-                self[name] = Facts(file, value)
+class Rounds(TypedDict):
+    """How DAgger's rounds were made: what is read of it, beside other fields."""
 
-    def __missing__(self, name: str):
-        raise InputError(f"{self.file} has no '{name}'.")
+    demonstrations: int
+    rounds: list[dict[str, Any]]
+
+
+class Provenance(TypedDict):
+    """How a data set was made: what is read of `meta/constructskill.json`, beside other fields."""
+
+    generator: dict[str, Any]
+    attempts: Count
+    discarded_seeds: list[Seed]
+    versions: dict[Word, Version]
+    noise_covariance: list[list[float]]
+    sha256: dict[str, str]
+    dagger: NotRequired[Rounds]
+
+
+PROVENANCE = Json("the record of how a data set was made", Provenance)
 
 
 @dataclass(frozen=True)
@@ -77,9 +89,9 @@ class DataSet:
     """
 
     root: Path
-    info: Facts
-    stats: Facts
-    facts: Facts
+    info: dict[str, Any]
+    stats: dict[str, dict[str, Any]]
+    facts: Provenance
     rows: pd.DataFrame
     episodes: pd.DataFrame
     tasks: list[str]
@@ -92,12 +104,14 @@ class DataSet:
         """
         if name not in self.rows:
             raise InputError(f"data/ has no column {name}.")
-        values, wanted = self.rows[name], tuple(self.info["features"][name]["shape"])
+        if name not in self.info["features"]:
+            raise InputError(f"{INFO} has no '{name}'.")
+        values, feature = self.rows[name], self.info["features"][name]
+        wanted, kind = tuple(feature["shape"]), feature["dtype"]
         wrong = {np.shape(value) or (1,) for value in values} - {wanted}
         if wrong:
             raise InputError(f"{name} has values of shape {wrong.pop()}, not {wanted} as info.json says.")
         column = np.stack(values) if len(np.shape(values.iloc[0])) else values.to_numpy()
-        kind = self.info["features"][name]["dtype"]
         if kind in NUMBERS and column.dtype.kind not in NUMBERS[kind]:
             raise InputError(f"{name} has values that are no {kind}, as info.json says, or lacks some.")
         return column
@@ -157,7 +171,7 @@ def open_dataset(root: Path) -> DataSet:
     data = DataSet(
         root=root,
         info=info,
-        stats=read_facts(root, "meta/stats.json", STATISTICS),
+        stats=STATISTICS.read(root / "meta/stats.json"),
         facts=read_provenance(root),
         rows=_tables(root, "data/*/*.parquet"),
         episodes=_tables(root, "meta/episodes/*/*.parquet"),
@@ -173,7 +187,7 @@ def open_dataset(root: Path) -> DataSet:
     return data
 
 
-def read_info(root: Path) -> Facts:
+def read_info(root: Path) -> dict[str, Any]:
     """LeRobot's description of a data set.
 
     Raises:
@@ -182,14 +196,14 @@ def read_info(root: Path) -> Facts:
     """
     if not (root / INFO).is_file():
         raise MissingError(f"There is no data set in {root}: {INFO} is missing.")
-    info = read_facts(root, INFO, DATA_SET)
+    info = DATA_SET.read(root / INFO)
     template = info.get("video_path")
     if template is not None and not (PLACE.fullmatch(template) and ".." not in template):
         raise InputError(f"video_path in '{root / INFO}' is no place in the data set: {template[:100]!a}.")
     return info
 
 
-def read_provenance(root: Path) -> Facts:
+def read_provenance(root: Path) -> Provenance:
     """How a data set was made.
 
     Raises:
@@ -201,17 +215,7 @@ def read_provenance(root: Path) -> Facts:
             f"{root} has no {SIDECAR}, which says how it was made: only constructskill-generate writes it, and "
             "lerobot-edit-dataset removes it when it deletes, splits or merges."
         )
-    return read_facts(root, SIDECAR, MADE)
-
-
-def read_facts(root: Path, name: str, kind: Json = OBJECT) -> Facts:
-    """The JSON object in a file of a folder.
-
-    Raises:
-        MissingError: there is no such file.
-        InputError: it holds something else.
-    """
-    return Facts(name, kind.read(root / name))
+    return PROVENANCE.read(root / SIDECAR)
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:

@@ -103,19 +103,13 @@ def check_reading(data: DataSet) -> Iterator[str]:
     """
     shown = {camera: dict(islice(pictures(data, camera), READ_FRAMES)) for camera in data.cameras}
     rows = np.random.default_rng(0).permutation(min(READ_FRAMES, len(data.rows))).tolist()
-    by_default = open_lerobot(data.config.repo_id, data.root)
-    wrong = [row for row in rows if not _is_read(by_default, row, shown)]
-    if not wrong:
-        return
-    by_pyav = open_lerobot(data.config.repo_id, data.root, video_backend="pyav")
-    is_read = all(_is_read(by_pyav, row, shown) for row in wrong)
-    remedy = "; until then, train with --dataset.video_backend=pyav" if is_read else ""
-    yield (
-        f"LeRobot's default decoder refuses {len(wrong)} of {len(rows)} frames, or takes others for them, first "
-        f"{min(wrong)}: it cannot read at random what is encoded in open groups of pictures. Make the set again with "
-        "this version of constructskill-generate and the settings that meta/constructskill.json has under "
-        f"'generator'{remedy}."
-    )
+    dataset = open_lerobot(data.config.repo_id, data.root)
+    if wrong := [row for row in rows if not _is_read(dataset, row, shown)]:
+        yield (
+            f"LeRobot's default decoder refuses {len(wrong)} of {len(rows)} frames, or takes others for them, first "
+            f"{min(wrong)}: it cannot read at random what is encoded in open groups of pictures. Encode the videos in "
+            "closed groups, as constructskill-generate does, or train with --dataset.video_backend=pyav."
+        )
 
 
 def _is_read(dataset: "LeRobotDataset", row: int, shown: Mapping[str, Pictures]) -> bool:

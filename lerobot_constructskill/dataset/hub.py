@@ -76,18 +76,13 @@ def locate(repo_id: str | None, root: Path | None = None, revision: str | None =
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
     revision = revision or CODEBASE_VERSION
-    with one_sentence(repo_id, revision):
+    with hub_errors(repo_id, revision):
         folder = snapshot_download(repo_id, repo_type="dataset", revision=revision, cache_dir=HF_LEROBOT_HUB_CACHE)
     return Path(folder)
 
 
-def open_lerobot(
-    repo_id: str, root: Path | None, revision: str | None = None, video_backend: str | None = None
-) -> "LeRobotDataset":
+def open_lerobot(repo_id: str, root: Path | None, revision: str | None = None) -> "LeRobotDataset":
     """The data set in `root`, else in LeRobot's cache or on the Hub, as LeRobot opens it.
-
-    Args:
-        video_backend: LeRobot's decoder; its default is torchcodec where that is installed.
 
     Raises:
         FileNotFoundError: there is no data set in `root`.
@@ -99,8 +94,8 @@ def open_lerobot(
     if root is not None:
         read_info(root)
     try:
-        with one_sentence(repo_id, revision):
-            dataset = LeRobotDataset(repo_id, root=root, revision=revision, video_backend=video_backend)
+        with hub_errors(repo_id, revision):
+            dataset = LeRobotDataset(repo_id, root=root, revision=revision)
     except Exception as error:  # whatever a file can do to LeRobot, datasets and Arrow; no line of ours is in there
         if root is None and isinstance(error, UserError | OSError):
             raise
@@ -191,7 +186,7 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
 
 
 @contextmanager
-def one_sentence(repo_id: str, revision: str | None = None) -> Iterator[None]:
+def hub_errors(repo_id: str, revision: str | None = None) -> Iterator[None]:
     """Turn what huggingface_hub raises into an `OSError` of one sentence, which never quotes a request."""
     try:
         yield
@@ -271,7 +266,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
     from lerobot.datasets import CODEBASE_VERSION
 
     api, repo = HfApi(), {"repo_id": repo_id, "repo_type": "dataset"}
-    with one_sentence(repo_id):
+    with hub_errors(repo_id):
         api.create_repo(**repo, private=private, exist_ok=True)
         if private:
             check_private(**repo)

@@ -15,7 +15,7 @@ from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType, perturbed_task
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv, check_unperturbed
-from lerobot_constructskill.errors import InputError, heard_by_lerobot
+from lerobot_constructskill.errors import InputError, as_field_error
 from lerobot_constructskill.perturbations import Perturbation
 
 VECTORIZATIONS = ("process", "native")
@@ -53,7 +53,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     perturb_seed: Seed = 0
 
     def __post_init__(self):
-        with heard_by_lerobot():
+        with as_field_error():
             check(self)
             if self.max_parallel_tasks != 1:
                 raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")

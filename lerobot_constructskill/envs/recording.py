@@ -130,9 +130,7 @@ class Episode:
 ACTIONS = {list[np.ndarray]: pa.list_(pa.field("element", pa.float32(), nullable=False))}
 """Python's and Arrow's type of actions; `artifacts.tables` knows those of all other fields."""
 
-RECORDED = Parquet(
-    "a recording", Episode, ACTIONS, later=("clipped_steps", "final_error_m"), json={"versions": VERSIONS}
-)
+RECORDED = Parquet("a recording", Episode, ACTIONS, json={"versions": VERSIONS})
 
 
 def recorder(**facts: Any) -> Episode | None:

@@ -1,1 +1,1 @@
-"""Console commands, one file each: a configuration, and the call that it leads to. Nothing imports them."""
+"""Console commands: of each the configuration, and the function that it is handed to. No other room imports them."""

@@ -9,7 +9,7 @@ from lerobot_constructskill.bounds import Checked, Count, RepoId, Text
 from lerobot_constructskill.errors import InputError, MissingError, TakenError, plural
 from lerobot_constructskill.files import read_bytes
 from lerobot_constructskill.presets import KINDS, description, find, names
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 TRAIN = "train/"
 
@@ -90,6 +90,7 @@ def write(config: ConfigConfig) -> Path:
     return file
 
 
+@command(first=["name"])
 def show_or_write(config: ConfigConfig) -> str:
     """What `show` returns, or the path that `write` returns. Raises as they do."""
     if config.name is not None and config.name.startswith(TRAIN):
@@ -97,11 +98,3 @@ def show_or_write(config: ConfigConfig) -> str:
     if config != ConfigConfig(config.name):
         raise InputError(f"Flags are for configurations of {TRAIN}, which are written for a data set.")
     return show(config.name)
-
-
-def main() -> None:
-    run(ConfigConfig, show_or_write, first=["name"])
-
-
-if __name__ == "__main__":
-    main()

@@ -6,10 +6,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from itertools import takewhile
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, get_type_hints
 
 from lerobot_constructskill.errors import (
     InputError,
@@ -54,11 +54,26 @@ def run[Config](
 
         shipped = ", ".join(names(presets)) if presets else ""
         told = f"Instead of --config_path, the first argument can be a file or a name: {shipped}. "
-        flags = _put_names(sys.argv[1:], ("config_path",) if presets else first, presets)
+        flags = _name_values(sys.argv[1:], ("config_path",) if presets else first, presets)
         say(action(parse(config_class, flags, epilog=(told if presets else "") + EPILOG)))
 
 
-def _put_names(flags: list[str], first: Sequence[str], presets: str | None) -> list[str]:
+def command[Config](
+    presets: str | None = None, first: Sequence[str] = ()
+) -> Callable[[Callable[[Config], str]], Callable[[Config], str]]:
+    """Give a function that takes a configuration, its argument `config`, a `main` that is its console command.
+
+    `presets` and `first` are those of `run`.
+    """
+
+    def with_main(action: Callable[[Config], str]) -> Callable[[Config], str]:
+        action.main = partial(run, get_type_hints(action)["config"], action, presets, first)
+        return action
+
+    return with_main
+
+
+def _name_values(flags: list[str], first: Sequence[str], presets: str | None) -> list[str]:
     """Put the names of fields before values that come before all flags; of `presets` a value is a name or a file."""
     values = list(takewhile(lambda flag: not flag.startswith("-"), flags if first else ()))
     if len(values) > len(first):
@@ -81,13 +96,13 @@ def edge() -> Iterator[None]:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     command, debug = list(sys.argv), DEBUG in sys.argv
     sys.argv = [argument for argument in sys.argv if argument != DEBUG]
-    logging.getLogger().addFilter(_is_news)
+    logging.getLogger().addFilter(_is_worth_printing)
     _open_streams()
-    _hear_no_destructors()
+    _silence_destructors()
     try:
         yield
-        if _unread:
-            said = f"standard output cannot be written to ({_unread.pop().strerror}); what was asked for is done"
+        if _output_errors:
+            said = f"standard output cannot be written to ({_output_errors.pop().strerror}); the work is done"
             raise MachineError(said)
     except (Exception, KeyboardInterrupt) as error:
         sys.exit(_report(error, command, debug))
@@ -107,7 +122,7 @@ def _open_streams() -> None:
 
 
 @cache
-def _hear_no_destructors() -> None:
+def _silence_destructors() -> None:
     """Silence tracebacks of an `OSError` in destructors: PyAV's would repeat the sentence about a full disk."""
     of_errors, of_destructors = sys.excepthook, sys.unraisablehook
     sys.excepthook = lambda kind, error, trace: isinstance(error, OSError) or of_errors(kind, error, trace)
@@ -124,14 +139,14 @@ def say(text: str) -> None:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):
-            _unread.append(error)
+            _output_errors.append(error)
 
 
-_unread: list[OSError] = []
+_output_errors: list[OSError] = []
 """The error of writing to standard output, if there was one."""
 
 
-def _is_news(record: logging.LogRecord) -> bool:
+def _is_worth_printing(record: logging.LogRecord) -> bool:
     """Whether a record is worth printing; LeRobot warns at every policy that there is no GPU."""
     return not record.getMessage().startswith("No accelerated backend detected")
 
@@ -142,14 +157,14 @@ def _report(error: BaseException, command: list[str], debug: bool) -> int:
     log = keep_traceback(command, told)
     if debug or log is None:
         print(told, file=sys.stderr)
-    status, sentence = _judge(error)
+    status, sentence = _status_and_sentence(error)
     if status == FAULT:
         sentence += f"; the traceback is {'above' if log is None else f'in {log}'}"
     print(f"{name}: {sentence}", file=sys.stderr)
     return status
 
 
-def _judge(error: BaseException) -> tuple[int, str]:
+def _status_and_sentence(error: BaseException) -> tuple[int, str]:
     said = " ".join(str(error).split())
     said = said if len(said) <= LONGEST else f"{said[:LONGEST]}..."
     if isinstance(error, KeyboardInterrupt):

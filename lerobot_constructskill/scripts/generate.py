@@ -6,7 +6,7 @@ from lerobot_constructskill.scripts.console import run, say
 
 
 def generate(config: GenerateConfig) -> str:
-    from lerobot_constructskill.scripts.card import CardConfig, write_card
+    from lerobot_constructskill.scripts.dataset import CardConfig, write_card
 
     root, attempts = record(config)
     lengths = [attempt.frames for attempt in attempts if attempt.success]

@@ -9,8 +9,11 @@ from lerobot_constructskill.bounds import Checked, RepoId
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_task
 from lerobot_constructskill.dataset.card import render_template
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
+
+OBJECT = Json("a JSON object")
 
 PUSHED = ["*.safetensors", "*.json"]
 """Files of a checkpoint that leave the machine: weights, configurations and processors."""
@@ -27,6 +30,7 @@ class PushPolicyConfig(Checked):
     private: bool = False  # whether only its owner sees it
 
 
+@command()
 def push_policy(config: PushPolicyConfig) -> str:
     """Push and return the name.
 
@@ -37,18 +41,17 @@ def push_policy(config: PushPolicyConfig) -> str:
     """
     from huggingface_hub import HfApi
 
-    from lerobot_constructskill.dataset.dataset import read_facts
-    from lerobot_constructskill.dataset.hub import check_private, one_sentence
+    from lerobot_constructskill.dataset.hub import check_private, hub_errors
 
     for name in (TRAIN_CONFIG, "config.json"):
         if not (config.policy_path / name).is_file():
             raise MissingError(f"{config.policy_path / name} is missing: name a checkpoint's pretrained_model folder.")
-    train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), read_facts(config.policy_path, "config.json")
+    train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), OBJECT.read(config.policy_path / "config.json")
     record = config.policy_path / "encoder.json"
-    encoder = read_facts(config.policy_path, record.name) if record.is_file() else {}
+    encoder = OBJECT.read(record) if record.is_file() else {}
     outcomes, task = seed_outcomes(config.evaluations), get_task(config.task).name
     card, api = render_card(config.repo_id, outcomes, task, train, policy, encoder), HfApi()
-    with one_sentence(config.repo_id):
+    with hub_errors(config.repo_id):
         api.create_repo(config.repo_id, private=config.private, exist_ok=True)
         if config.private:
             check_private(config.repo_id)
@@ -102,7 +105,3 @@ def render_card(
         policy=policy,
         encoder=encoder,
     )
-
-
-def main() -> None:
-    run(PushPolicyConfig, push_policy)

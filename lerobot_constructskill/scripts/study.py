@@ -6,12 +6,12 @@ from pathlib import Path
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.bounds import Count
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.parsing import tells_of_bases
+from lerobot_constructskill.parsing import with_fields_of_bases
 from lerobot_constructskill.scripts.console import run
 from lerobot_constructskill.study.spec import Options, Study
 
 
-@tells_of_bases
+@with_fields_of_bases
 @dataclass(frozen=True)
 class StudyConfig(Options, Study):
     """Make what is missing of a study and keep what exists; after a kill the same command continues.

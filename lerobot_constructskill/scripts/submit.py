@@ -10,6 +10,8 @@ from lerobot_constructskill.bounds import Among, Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import run
 
+Suite = Annotated[str, Among(tuple(BOARD_SUITES))]
+
 
 @dataclass
 class SubmitConfig:
@@ -19,7 +21,7 @@ class SubmitConfig:
     `recorded/seed_<training seed>`.
     """
 
-    suite: Annotated[str, Among(tuple(BOARD_SUITES))]  # its settings and starts are evaluated
+    suite: Suite  # its settings and starts are evaluated
     about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; optional: url and notes
     root: Path  # the folder to write
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed

@@ -159,14 +159,9 @@ class Row(EpisodeRow):
     video: str | None = None
 
 
-LATER = ("clipped_steps",)
-"""Columns that tables of before 2026-11-26 do not have."""
-
 TABLES = {
-    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, json={"versions": VERSIONS}, later=LATER),
-    Row: Parquet(
-        "a table of a study's rows", Row, json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS}, later=LATER
-    ),
+    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, json={"versions": VERSIONS}),
+    Row: Parquet("a table of a study's rows", Row, json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS}),
 }
 
 NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype(), pa.string(): pd.StringDtype()}

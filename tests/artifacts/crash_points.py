@@ -146,7 +146,7 @@ def scenario_generate(root: Path) -> None:
 
 def scenario_card(root: Path) -> None:
     """The card of such a data set, with its pictures."""
-    from lerobot_constructskill.scripts.card import CardConfig, write_card
+    from lerobot_constructskill.scripts.dataset import CardConfig, write_card
 
     source = root.parent / "card_source"
     if not source.exists():

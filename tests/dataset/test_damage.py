@@ -18,8 +18,7 @@ from lerobot_constructskill.dataset.hub import PUSHED, open_lerobot
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import bounded_memory
-from lerobot_constructskill.scripts.card import CardConfig, write_card
-from lerobot_constructskill.scripts.check import CheckConfig, check_dataset
+from lerobot_constructskill.scripts.dataset import CardConfig, CheckConfig, check_dataset, write_card
 from lerobot_constructskill.scripts.push_policy import render_card, seed_outcomes
 
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)

@@ -16,8 +16,7 @@ from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.dataset.hub import locate, push
 from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.errors import InputError, TakenError
-from lerobot_constructskill.scripts.card import CardConfig, write_card
-from lerobot_constructskill.scripts.push import PushConfig, push_dataset
+from lerobot_constructskill.scripts.dataset import CardConfig, PushConfig, push_dataset, write_card
 
 pytestmark = pytest.mark.slow
 

@@ -3,7 +3,7 @@
 import pytest
 from torchcodec.decoders import VideoDecoder
 
-from lerobot_constructskill.scripts.film import FilmConfig, film
+from lerobot_constructskill.scripts.expert import FilmConfig, film
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 

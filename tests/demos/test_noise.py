@@ -7,9 +7,8 @@ from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 from lerobot_constructskill.parsing import parse
-from lerobot_constructskill.scripts.check_task import CheckTaskConfig
-from lerobot_constructskill.scripts.film import FilmConfig
-from lerobot_constructskill.scripts.fit_noise import fit_covariance
+from lerobot_constructskill.scripts.expert import CheckTaskConfig, FilmConfig
+from lerobot_constructskill.scripts.held_out import fit_covariance
 
 COVARIANCE = np.array([[9.0, 3.0, 0.0], [3.0, 4.0, -1.0], [0.0, -1.0, 1.0]]) * 1e-6
 FITTED = COVARIANCE.tolist()
@@ -85,20 +84,9 @@ def test_a_constant_bias_is_error_too():
     np.testing.assert_allclose(fit_covariance([np.full((5, 3), 0.01)]), np.full((3, 3), 1e-4))
 
 
-def test_alpha_is_the_squared_error_of_an_episode():
-    errors = [np.random.default_rng(0).normal(size=(n, 3)) for n in (50, 150)]
-    covariance = fit_covariance(errors, alpha=0.04)
-    assert np.trace(covariance) * 100 == pytest.approx(0.04)
-    np.testing.assert_allclose(covariance / np.trace(covariance), (c := fit_covariance(errors)) / np.trace(c))
-
-
-@pytest.mark.parametrize(
-    "errors, alpha, word",
-    [([], None, "no frame"), ([np.ones((2, 3))], 0.0, "alpha"), ([np.zeros((2, 3))], 1.0, "nothing to scale")],
-)
-def test_nothing_to_fit_is_told(errors, alpha, word):
-    with pytest.raises(ValueError, match=word):
-        fit_covariance(errors, alpha)
+def test_nothing_to_fit_is_told():
+    with pytest.raises(ValueError, match="no frame"):
+        fit_covariance([])
 
 
 def test_every_eighth_episode_is_held_out():

@@ -27,7 +27,7 @@ from lerobot_constructskill.rollout.offline import (
     policy_errors,
     predict,
 )
-from lerobot_constructskill.scripts.offline import OfflineConfig, evaluate_offline
+from lerobot_constructskill.scripts.held_out import OfflineConfig, evaluate_offline
 from lerobot_constructskill.training.recipe import FACTS, Training
 
 EPISODES, CHUNK = [3, 7], 5
@@ -153,7 +153,9 @@ def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_s
         save_checkpoint(policy, feature_set, tmp_path / f"checkpoint_{seed}")
         (tmp_path / f"checkpoint_{seed}" / FACTS).write_text(json.dumps(said(seed, 8)))
     found = f"{tmp_path}/checkpoint_*"
-    asked = OfflineConfig([found], "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
+    asked = OfflineConfig(
+        policies=[found], repo_id="local/random", root=feature_set.root, episodes=EPISODES, out=tmp_path
+    )
     printed = evaluate_offline(asked)
     rows, table = json.loads((tmp_path / "offline.json").read_text()), pd.read_parquet(tmp_path / "offline.parquet")
     assert "n/a" in printed and [row["policy"] for row in rows] == ["frozen_vit"] * 2
@@ -172,7 +174,9 @@ def test_a_readout_of_patches_is_evaluated_on_their_features(readout, config, fe
     (trained,) = train_seeds(fields, feature_set, [0], epochs=1, batch_size=16, held_out=EPISODES)
     save_checkpoint(trained, feature_set, tmp_path / "checkpoint")
     found = [str(tmp_path / "checkpoint")]
-    asked = OfflineConfig(found, "local/random", feature_set.root, episodes=EPISODES, out=tmp_path)
+    asked = OfflineConfig(
+        policies=found, repo_id="local/random", root=feature_set.root, episodes=EPISODES, out=tmp_path
+    )
     evaluate_offline(asked)
     (row,) = json.loads((tmp_path / "offline.json").read_text())
     error = heldout_mse(tmp_path / "checkpoint", feature_set, EPISODES)
@@ -185,7 +189,11 @@ def test_features_of_another_encoder_are_not_scored(checkpoint, feature_set, tmp
     info["features"]["observation.features.base"]["info"]["weights_sha256"] = "0" * 64
     (other / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(InputError, match="not made by this policy's encoder: weights_sha256 0000"):
-        evaluate_offline(OfflineConfig([str(checkpoint)], "local/random", other, episodes=EPISODES, out=tmp_path))
+        evaluate_offline(
+            OfflineConfig(
+                policies=[str(checkpoint)], repo_id="local/random", root=other, episodes=EPISODES, out=tmp_path
+            )
+        )
     assert not (tmp_path / "offline.json").exists()
 
 
@@ -205,7 +213,7 @@ def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint
     monkeypatch.setattr(hub, "held_out", lambda episodes: EPISODES)  # every fourth of eight
     trained = shutil.copytree(checkpoint, tmp_path / "checkpoint")
     (trained / TRAIN_CONFIG).write_text(json.dumps({"dataset": {"repo_id": "local/random"} | told}))
-    asked = OfflineConfig([str(trained)], "local/random", feature_set.root, out=tmp_path)
+    asked = OfflineConfig(policies=[str(trained)], repo_id="local/random", root=feature_set.root, out=tmp_path)
     with pytest.raises(InputError, match=seen) if seen else nullcontext():
         evaluate_offline(asked)
     evaluate_offline(replace(asked, episodes=EPISODES))
@@ -302,10 +310,14 @@ class FakeDataset(list):
 
 def test_what_is_not_there_is_refused_in_one_sentence(feature_set, tmp_path):
     with pytest.raises(FileNotFoundError, match="matches no checkpoint"):
-        evaluate_offline(OfflineConfig([str(tmp_path / "none")], "local/random", feature_set.root))
+        evaluate_offline(
+            OfflineConfig(policies=[str(tmp_path / "none")], repo_id="local/random", root=feature_set.root)
+        )
     (tmp_path / "config.json").touch()
     with pytest.raises(ValueError, match="must be among 0 to 7"):
-        evaluate_offline(OfflineConfig([str(tmp_path)], "local/random", feature_set.root, episodes=[8]))
+        evaluate_offline(
+            OfflineConfig(policies=[str(tmp_path)], repo_id="local/random", root=feature_set.root, episodes=[8])
+        )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from lerobot.optim import AdamWConfig
 from lerobot.utils import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
-from lerobot_constructskill.errors import InputError, heard_by_lerobot
+from lerobot_constructskill.errors import InputError, as_field_error
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
 from .backbones import IMAGE_SIZE, check_backbone
@@ -142,7 +142,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     scheduler_warmup_steps: Annotated[int, Range(0, 100_000_000, unit="steps")] | None = None
 
     def __post_init__(self) -> None:
-        with heard_by_lerobot():
+        with as_field_error():
             self._check()
         super().__post_init__()
         # Entry of the encoded frames in the data set's `features`, None where it has images; no field of a checkpoint.

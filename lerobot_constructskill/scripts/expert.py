@@ -1,23 +1,26 @@
-"""`constructskill-film`: film the scripted expert of a task."""
+"""Commands about the scripted expert of a task: `constructskill-film` and `constructskill-check-task`."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.bounds import Among, Checked, Seed
+from lerobot_constructskill.bounds import Among, Checked, Count, Seed
 from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.parsing import tells_of_bases
+from lerobot_constructskill.parsing import with_fields_of_bases
 from lerobot_constructskill.progress import Progress, quiet
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
+
+REQUIRED = 0.95
+"""Share of random initial states in which an expert must succeed."""
 
 
-@tells_of_bases
+@with_fields_of_bases
 @dataclass(frozen=True)
 class NoNoise(NoiseConfig):
     """`NoiseConfig` for commands that add no noise by default; draccus takes no default from a field's value.
@@ -50,11 +53,12 @@ class FilmConfig(Checked):
             raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
 
+@command()
 def film(config: FilmConfig) -> str:
     """Write the video and return a line that says where, and how the episode ended.
 
     Raises:
-        ValueError: no such task, view or perturbation.
+        InputError: there is no such task, view or perturbation.
         OSError: there is nothing to render with, or the video cannot be written.
     """
     from lerobot_constructskill.lerobot_internals import write_video
@@ -76,5 +80,49 @@ def film(config: FilmConfig) -> str:
     return f"{out}: {len(frames) / FPS:.0f} s, {'placed' if success else 'not placed'}"
 
 
-def main() -> None:
-    run(FilmConfig, film)
+@dataclass
+class CheckTaskConfig(Checked):
+    """Measure the expert of one task of the contract table in random initial states."""
+
+    task: str  # a name in `contract.TASKS`
+    states: Count = 100  # random initial states, without rendering
+    noise: NoNoise = field(default_factory=NoNoise)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+
+
+@command()
+def check_task(config: CheckTaskConfig) -> str:
+    """Measure the expert and return the outcome in a sentence.
+
+    Raises:
+        InputError: there is no such task, or its expert succeeds too seldom.
+    """
+    from lerobot_constructskill.analysis.stats.intervals import clopper_pearson
+    from lerobot_constructskill.analysis.stats.outcomes import Counts
+
+    lengths, failures = measure_expert(config)
+    _, low, high = clopper_pearson(Counts(len(lengths), config.states))
+    report = (
+        f"{config.task}: the expert succeeds in {len(lengths)} of {config.states} initial states "
+        f"(95 % Clopper-Pearson {low:.1%} to {high:.1%}), in at most {max(lengths, default=0)} of "
+        f"{get_task(config.task).horizon} steps. "
+        f"`constructskill-film --task={config.task} --view=policy` shows what a policy sees."
+    )
+    if len(failures) > (1 - REQUIRED) * config.states:
+        raise InputError(f"{report} That is below {REQUIRED:.0%}; it failed at seeds {failures}.")
+    return report
+
+
+def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
+    """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
+    expert = make_expert(get_task(config.task), config.expert)
+    env = ConstructSkillEnv(config.task, render_backend="none")
+    lengths, failures = [], []
+    for seed in Progress(range(DEMO_SEED_START, DEMO_SEED_START + config.states), "expert", unit="state"):
+        frames, success = demonstrate(env, expert, config.noise, seed)
+        if success:
+            lengths.append(len(frames))
+        else:
+            failures.append(seed)
+    env.close()
+    return lengths, failures
