@@ -3,8 +3,8 @@
 Usage: python benchmarks/run.py [name ...]
 
 The names are rendering, resets, encoders, training, keypoints, side_by_side, evaluation and scaling; all by default.
-Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the fast set are
-made on the first run, in outputs/bench ($BENCH_OUT).
+Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the fast set
+are made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
