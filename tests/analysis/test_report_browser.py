@@ -23,7 +23,7 @@ def test_page(study, browser, width):
     assert page.evaluate(OVERFLOW) == 0
     assert page.evaluate(CUT) == 0
     assert page.evaluate(IMAGES) == 0
-    assert page.evaluate(VISIBLE) == page.locator("figure:has(img)").count() == 4
+    assert page.evaluate(VISIBLE) == page.locator("figure:has(img)").count() == 3
     assert page.locator("table").count() > 5
     assert said == []
     beside = study.as_uri()

@@ -29,17 +29,20 @@ ALARM, MUTED = "#b8400a", "#667078"
 WIDTH = 9.2
 """Width of every figure in inches."""
 
+MOST_BESIDE = 12
+"""Number of training seeds up to which the two criteria stand side by side."""
+
 SHADES = 64
 """Number of colours in a PNG, which makes it a third as large and looks the same."""
 
 
 def write_figures(findings: Findings, folder: Path) -> None:
-    """Write the figures as PNG: `<setting>_seeds` and `<setting>_error`, and `sweeps`."""
+    """Write the figures as PNG: `seeds`, `<setting>_error` of each setting with held-out errors, and `sweeps`."""
     folder.mkdir(exist_ok=True)
     with matplotlib.rc_context(fname=STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a label may be in any script
+        save(seeds_figure(findings), folder / "seeds.png")
         for setting in findings.sections:
-            save(seeds_figure(setting, findings.episodes), folder / f"{setting.name}_seeds.png")
             if setting.validated:
                 save(error_figure(setting, findings.episodes), folder / f"{setting.name}_error.png")
         if findings.sweeps:
@@ -54,31 +57,21 @@ def save(figure: Figure, path: Path) -> None:
         Image.open(drawn).convert("RGB").quantize(SHADES).save(partial, format="png", optimize=True)
 
 
-def seeds_figure(setting: SettingFindings, episodes: int) -> Figure:
-    """The paper's Figure 2a: episodes of each run that met each criterion, one cell a training seed."""
-    seeds = sorted({seed for one in setting.variants for seed in one.training_seeds})
-    rows, columns = (2, 1) if len(seeds) > 12 else (1, 2)
-    figure, axes = _panels(rows * (0.75 + 0.3 * len(setting.variants)) + 0.2, rows, columns, sharey=True)
-    for axis, criterion in zip(axes, CRITERIA, strict=True):
-        by_variant = {one.name: one.runs.set_index("training_seed")[criterion] for one in setting.variants}
-        cells = pd.DataFrame(by_variant, index=seeds).T.to_numpy(float)
-        axis.pcolormesh(cells, cmap=RAMP, vmin=0, vmax=episodes, edgecolors="white", linewidth=2)
-        for y, one in enumerate(setting.variants):
-            for seed in one.training_seeds:
-                x = seeds.index(seed)
-                text, colour = _cell(cells[y, x], seed in set(one.failures["training_seed"]), episodes)
-                axis.text(x + 0.5, y + 0.5, text, color=colour, ha="center", va="center", fontsize=8)
-            if one.success:
-                met = "{}/{}".format(*one.success[criterion].counts)
-                axis.text(len(seeds) + 0.1, y + 0.5, met, va="center", fontsize=8.5)
-        step = 1 if len(seeds) <= 40 else 10
-        axis.set_xticks(np.arange(0, len(seeds), step) + 0.5, seeds[::step])
-        axis.set(title=criterion.capitalize(), xlabel="training seed")
-        axis.grid(visible=False)
-        axis.tick_params(length=0)
-        axis.spines[:].set_visible(False)
-    axes[0].set_yticks(np.arange(len(setting.variants)) + 0.5, [fill(one.label, 24) for one in setting.variants])
-    axes[0].invert_yaxis()
+def seeds_figure(findings: Findings) -> Figure:
+    """The paper's Figure 2a, for each setting: episodes of a run that met each criterion, one cell a training seed."""
+    sections = findings.sections
+    stacked = {setting.name: len(_seeds_of(setting)) > MOST_BESIDE for setting in sections}
+    heights = [(1 + stacked[one.name]) * (0.75 + 0.3 * len(one.variants)) + 0.2 for one in sections]
+    figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
+    parts = figure.subfigures(len(sections), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for part, setting in zip(parts, sections, strict=True):
+        rows, columns = (2, 1) if stacked[setting.name] else (1, 2)
+        axes = part.subplots(rows, columns, sharey=True)
+        for axis, criterion in zip(axes, CRITERIA, strict=True):
+            _draw_seeds(axis, setting, criterion, findings.episodes)
+            axis.set(title=f"{setting.label}: {criterion}" if len(sections) > 1 else criterion.capitalize())
+        axes[0].set_yticks(np.arange(len(setting.variants)) + 0.5, [fill(one.label, 24) for one in setting.variants])
+        axes[0].invert_yaxis()
     return figure
 
 
@@ -123,6 +116,32 @@ def _panels(height: float, rows: int = 1, columns: int = 2, **shared) -> tuple[F
     """A figure of `height` inches and its axes in reading order."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, list(figure.subplots(rows, columns, squeeze=False, **shared).flat)
+
+
+def _seeds_of(setting: SettingFindings) -> list[int]:
+    return sorted({seed for one in setting.variants for seed in one.training_seeds})
+
+
+def _draw_seeds(axis: Axes, setting: SettingFindings, criterion: str, episodes: int) -> None:
+    """Draw a row of cells for each variant, and to its right in how many seeds the criterion was met."""
+    seeds = _seeds_of(setting)
+    by_variant = {one.name: one.runs.set_index("training_seed")[criterion] for one in setting.variants}
+    cells = pd.DataFrame(by_variant, index=seeds).T.to_numpy(float)
+    axis.pcolormesh(cells, cmap=RAMP, vmin=0, vmax=episodes, edgecolors="white", linewidth=2)
+    for y, one in enumerate(setting.variants):
+        for seed in one.training_seeds:
+            x = seeds.index(seed)
+            text, colour = _cell(cells[y, x], seed in set(one.failures["training_seed"]), episodes)
+            axis.text(x + 0.5, y + 0.5, text, color=colour, ha="center", va="center", fontsize=8)
+        if one.success:
+            met = "{}/{}".format(*one.success[criterion].counts)
+            axis.text(len(seeds) + 0.1, y + 0.5, met, va="center", fontsize=8.5)
+    step = 1 if len(seeds) <= 40 else 10
+    axis.set_xticks(np.arange(0, len(seeds), step) + 0.5, seeds[::step])
+    axis.set(xlabel="training seed")
+    axis.grid(visible=False)
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
 
 
 def _cell(met: float, failed: bool, episodes: int) -> tuple[str, str]:

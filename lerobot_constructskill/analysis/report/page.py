@@ -51,6 +51,8 @@ STUDY_FILE = Yaml("a study's file", _Study)
 def write_report(root: Path) -> Path:
     """Write report.html, report.md and figures/ into a study's folder and return the page.
 
+    Both hold the same tables. Films, figures of held-out error and the study's file are on the page alone.
+
     Raises:
         MissingError: study.yaml or rows.parquet is missing.
         InputError: one of them cannot be read, or they do not belong together.
