@@ -23,7 +23,7 @@ CHAPTERS = [
 UNLINKED = [*sorted(ROOT.glob("website/assets/*")), *sorted(ROOT.glob("docs/films/*"))]
 """Files that only the configuration and pages made of the code refer to."""
 
-SHOWN_AS_THEY_ARE = {".md", ".png", ".jpg", ".mp4", ".parquet"}
+SHOWN_AS_THEY_ARE = {".md", ".gif", ".png", ".jpg", ".mp4", ".parquet"}
 LINK = re.compile(r"(?<=\]\()(?!\w+:)([^)#\s]+)")
 UNUSED = re.compile(r"\.map$|/lunr/")
 """Files of the theme for debuggers and for searches in other languages."""
