@@ -15,11 +15,11 @@ from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 
-from lerobot_constructskill.artifacts.digests import file_sha256, installed, stamp
+from lerobot_constructskill.artifacts.digests import installed, known_sha256, stamp
 from lerobot_constructskill.artifacts.revisions import LEFT_OUT, PACKAGE, revisions
 from lerobot_constructskill.errors import MachineError
 
-BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
+BY_VERSION = {"__main__", "lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
 """Top-level packages whose source is not hashed: LeRobot's version says enough, and our own code has revisions."""
 
 
@@ -67,13 +67,8 @@ def _source_sha256(package: str) -> str:
     for name in sorted(_with_helpers(package)):
         for relative, path in sorted(_files(name).items()):
             total.update(f"{name}/{relative}".encode())
-            total.update(bytes.fromhex(_sha256(*stamp(path))))
+            total.update(bytes.fromhex(known_sha256(path)))
     return total.hexdigest()
-
-
-@cache
-def _sha256(path: Path, size: int, mtime_ns: int) -> str:
-    return file_sha256(path)
 
 
 def _with_helpers(package: str) -> set[str]:

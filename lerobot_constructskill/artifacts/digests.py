@@ -20,6 +20,16 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def known_sha256(path: Path) -> str:
+    """The same of a file that may be asked for often: it is read anew when its size or its time has changed."""
+    return _known_sha256(*stamp(path))
+
+
+@cache
+def _known_sha256(path: Path, size: int, mtime_ns: int) -> str:
+    return file_sha256(path)
+
+
 def stamp(path: Path) -> tuple[Path, int, int]:
     """A file as it is now: what is known of it holds until its size or its time changes."""
     status = path.stat()

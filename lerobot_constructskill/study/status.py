@@ -11,7 +11,7 @@ from lerobot_constructskill.artifacts.store import LOG
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import EVALUATION, ROUNDS, TRAINING, seconds_per_run
+from lerobot_constructskill.study.timing import seconds_per_run
 
 SHOWN = 3
 """Changes that are named; more are counted."""
@@ -24,7 +24,7 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
         chosen: those that the command is asked for.
         retry_failed: whether it makes failed runs again.
     """
-    due = [run for run in chosen if (rows := table.episodes(run)) is None or (retry_failed and rows[0].error_kind)]
+    due = [run for run in chosen if (rows := table.made(run)) is None or (retry_failed and rows[0].error_kind)]
     lines = []
     for name, runs in groupby(chosen, key=_arm):
         runs = list(runs)
@@ -39,10 +39,10 @@ def _arm(run: Run) -> str:
 
 
 def _counts(table: Table, runs: Sequence[Run]) -> str:
-    made = [rows for run in runs if (rows := table.episodes(run))]
+    made = [rows for run in runs if (rows := table.made(run))]
     failed = sum(bool(rows[0].error_kind) for rows in made)
     counts = f"{len(made) - failed} finished, {failed} failed, {len(runs) - len(made)} missing"
-    changes = Counter(filter(None, (_changed(table, run) for run in runs if not table.episodes(run))))
+    changes = Counter(filter(None, (_changed(table, run) for run in runs if not table.made(run))))
     told = [f"{number} made before with another {what}" for what, number in changes.items()]
     return f"{counts} ({'; '.join(told)})" if told else counts
 
@@ -66,7 +66,7 @@ def _changed(table: Table, run: Run) -> str | None:
 
 def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
     """A line for each reason."""
-    failed = [(run, rows[0]) for run in runs if (rows := table.episodes(run)) and rows[0].error_kind]
+    failed = [(run, rows[0]) for run in runs if (rows := table.made(run)) and rows[0].error_kind]
     lines = []
     for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
         own = [run for run, _ in alike]
@@ -81,12 +81,8 @@ def _seeds(runs: Sequence[Run]) -> str:
 
 def _seconds(table: Table, runs: Sequence[Run]) -> float | None:
     """How long runs of one arm take, by how long its last ones took in this folder; None if that is not known."""
-    took = seconds_per_run(table.root).get(_arm(runs[0]), {})
-    untrained = [run for run in runs if run.checkpoints and not table.store.has(run.checkpoints)]
-    training = ROUNDS if runs[0].arm.rounds else TRAINING
-    if EVALUATION not in took or (untrained and training not in took):
-        return None
-    return len(runs) * took[EVALUATION] + (len(untrained) * took[training] if untrained else 0)
+    took = seconds_per_run(table.root).get(_arm(runs[0]))
+    return took and len(runs) * took
 
 
 def _time(table: Table, runs: Sequence[Run]) -> str:

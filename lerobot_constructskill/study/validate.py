@@ -22,10 +22,10 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
         failed = store.get_all(nodes, machine)
-        for said in dict.fromkeys(map(str, failed.values())):
+        for said in dict.fromkeys(failure.said for failure in failed.values()):
             logger.warning("%s is not validated on %s: %s", arm.id, data.name, said)
-        for node, error in failed.items():
-            store.note(node, error)
+        for node, failure in failed.items():
+            store.note(node, failure)
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, DataSet]]:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -88,7 +89,7 @@ class Checkpoints(Node):
 
     @cached_property
     def inputs(self) -> dict[str, Node]:
-        return {"data": self.learner.trainer.learns_from(self.learner.here, self.demonstrations)}
+        return {"data": self.learner.trainer.learns_from(self.learner.config, self.demonstrations)}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Train the seeds. Raises whatever the trainer raises."""
@@ -96,7 +97,8 @@ class Checkpoints(Node):
         dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
         kept_out = held_out(dataset.num_episodes, self.training.holdout)
         folder.mkdir()
-        made_of = self.learner.trainer.fit(self.learner.here, dataset, self.seeds, self.training, kept_out, folder)
+        config = deepcopy(self.learner.config)  # which a trainer may change
+        made_of = self.learner.trainer.fit(config, dataset, self.seeds, self.training, kept_out, folder)
         for seed in self.seeds:
             facts = {"seed": seed, "training": asdict(self.training), "made_of": made_of}
             (checkpoint_of(seed, folder) / FACTS).write_text(json.dumps(facts) + "\n", encoding="utf-8")

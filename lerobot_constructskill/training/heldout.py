@@ -40,7 +40,7 @@ class HeldOutError(Node):
     @cached_property
     def inputs(self) -> dict[str, Node]:
         learner = self.checkpoints.learner
-        data = learner.trainer.learns_from(learner.here, self.demonstrations)
+        data = learner.trainer.learns_from(learner.config, self.demonstrations)
         return {"checkpoint": self.checkpoints, "data": data}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
