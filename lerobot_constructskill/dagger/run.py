@@ -1,6 +1,7 @@
 """A DAgger run, step by step; whatever is in the store already is taken from there."""
 
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,12 +17,14 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import totals
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import MADE, SIDECAR
-from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.training.checkpoints import checkpoint_of
 from lerobot_constructskill.training.heldout import HeldOutError, read_error
 from lerobot_constructskill.training.trainers import flush_denormals
 
 ROUNDS = "rounds.json"
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -31,8 +34,8 @@ class Line:
     Args:
         policy: its number; policy 0 learnt from the demonstrations alone.
         frames: of the data set that it was trained on, each with one expert's label.
-        heldout_mse_m2: its error on that set's held-out episodes, in m2; None for a policy whose chunks need more than
-            single frames.
+        heldout_mse_m2: its error on that set's held-out episodes, in m2; None where it could not be measured, as of a
+            policy whose chunks need more than single frames.
         drove: `rounds.totals` of the round that it drove, None for the last policy.
         evaluated: the same of its evaluation, None without one.
     """
@@ -95,10 +98,10 @@ def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
 
 def _heldout_error(plan: Plan, number: int, store: Store, machine: Machine) -> float | None:
     store.get(plan.checkpoint(number), machine)
-    try:
-        return read_error(store.get(HeldOutError(plan.checkpoint(number), plan.seed, plan.data(number)), machine))
-    except InputError:
-        return None
+    error = HeldOutError(plan.checkpoint(number), plan.seed, plan.data(number))
+    for failure in store.get_all([error], machine).values():
+        logger.warning("Policy %d is not validated: %s", number, failure.said)
+    return read_error(store.folder(error)) if store.has(error) else None
 
 
 def _copy_data(data: Path, repo_id: str, folder: Path) -> None:

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -21,15 +20,12 @@ from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY
+from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY, WALL_TIME
 from lerobot_constructskill.study.runs import Job, Run, make_runs
 from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.validate import validate
 from lerobot_constructskill.training.trainers import flush_denormals
-
-WALL_TIME = "wall time, s"
-"""Entry of `PROVENANCE`: how long the sessions of a study took, added up."""
 
 logger = logging.getLogger(__name__)
 
@@ -53,7 +49,8 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         table = Table(root, runs, store)
         _check_nothing_is_lost(table)
         write_text(root / STUDY, text)
-        earlier, start = _provenance(root), time.monotonic()
+        facts = root / PROVENANCE
+        earlier, start = KNOWN.read(facts) if facts.exists() else {}, time.monotonic()
         for run in chosen:
             if options.retry_failed:
                 table.forget_failure(run)
@@ -119,15 +116,16 @@ def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
 
         with open_pool(options.executor, options.workers) as submit:
             for future in as_completed([submit(_make_all, job) for job in jobs]):
-                with _noted(stopped):
-                    yield from future.result()
+                made, lost = future.result()
+                stopped += lost
+                yield from made
     if stopped:
         raise stopped[0]
 
 
 @contextmanager
 def _noted(stopped: list[Exception]) -> Iterator[None]:
-    """Put what stops one job where it is found at the end."""
+    """Add what the machine does to one job to a list, and go on with the next one."""
     try:
         yield
     except (OSError, MemoryError, RuntimeError) as error:
@@ -137,24 +135,15 @@ def _noted(stopped: list[Exception]) -> Iterator[None]:
         stopped.append(error)
 
 
-def _make_all(job: Job) -> list[Run]:
+def _make_all(job: Job) -> tuple[list[Run], list[Exception]]:
+    """In another process: the runs that were made, and what stopped the others."""
     flush_denormals()
     load_plugins()  # another machine does not know other packages' references yet
-    return list(make_runs(job))
-
-
-def _provenance(root: Path) -> dict[str, Any]:
-    """What earlier sessions of the study said, each up to the last run that it finished.
-
-    Raises:
-        InputError: it is damaged, or its time is no number.
-    """
-    path = root / PROVENANCE
-    facts = {"machine": "", WALL_TIME: 0} | (KNOWN.read(path) if path.exists() else {})
-    took = facts[WALL_TIME]
-    if isinstance(took, bool) or not isinstance(took, int | float) or not 0 <= took < math.inf:
-        raise InputError(f"'{path}': '{WALL_TIME}' must be a number of seconds, not {took!r}.")
-    return facts
+    made, stopped = [], []
+    with _noted(stopped):
+        for run in make_runs(job):
+            made.append(run)
+    return made, stopped
 
 
 def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> None:
@@ -164,9 +153,9 @@ def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> No
         earlier: what it said when this session began.
         seconds: how long this session has taken.
     """
-    machines = [*earlier["machine"].split("; "), f"{os.cpu_count()} cores, {processor()}"]
+    machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
     facts = earlier | {
-        WALL_TIME: round(earlier[WALL_TIME] + seconds),
+        WALL_TIME: round(earlier.get(WALL_TIME, 0) + seconds),
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
     }
     write_text(root / PROVENANCE, json.dumps(facts, indent=2) + "\n")

@@ -14,7 +14,7 @@ import torch
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
-from lerobot_constructskill.artifacts import revisions
+from lerobot_constructskill.artifacts import pools, revisions
 from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.revisions import BEFORE
@@ -347,7 +347,7 @@ def test_going_on_with_a_published_study_adds_to_its_provenance(tmp_path, monkey
     facts = json.loads((root / PROVENANCE).read_text())
     assert facts["wall time, s"] >= 2000 and facts[stage] == 700 and facts["beside it"] == "tests"
     (root / PROVENANCE).write_text('{"wall time, s": "1 h"}')
-    with pytest.raises(InputError, match="'wall time, s' must be a number of seconds, not '1 h'"):
+    with pytest.raises(InputError, match="wall time, s: Input should be a valid number"):
         run_study(study(), "", root, Store(tmp_path / "s"), Options())
 
 
@@ -460,6 +460,20 @@ def test_what_a_machine_lacks_for_one_job_leaves_the_others_alone(tmp_path, monk
     with pytest.raises(MachineError, match="out of memory"):
         made.extend(session._execute(session._jobs(list_runs(study()), tmp_path, None, Options()), Options()))
     assert {run.arm.name for run in made} == {"no_op", "replay", "b"}
+
+
+def test_what_a_job_elsewhere_made_before_it_stopped_is_kept(tmp_path, monkeypatch):
+    def make(job):
+        yield job.runs[0]
+        raise MachineError("out of memory")
+
+    monkeypatch.setattr(session, "make_runs", make)
+    monkeypatch.setattr(session, "open_pool", lambda *_: pools.open_pool("processes", 1))  # in the place of Ray
+    made, options = [], Options(executor="ray")
+    with pytest.raises(MachineError, match="out of memory"):
+        for run in session._execute(session._jobs(list_runs(study()), tmp_path, None, options), options):
+            made.append(run.arm.name)
+    assert sorted(made) == ["a", "b", "no_op", "replay"]
 
 
 def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
