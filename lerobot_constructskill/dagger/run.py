@@ -37,21 +37,17 @@ class Line:
         heldout_mse_m2: its error on that set's held-out episodes, in m2; None where it could not be measured, as of a
             policy whose chunks need more than single frames.
         drove: `rounds.totals` of the round that it drove, None for the last policy.
-        evaluated: the same of its evaluation, None without one.
     """
 
     policy: int
     frames: int
     heldout_mse_m2: float | None
     drove: dict[str, Any] | None
-    evaluated: dict[str, Any] | None
 
     def __str__(self) -> str:
         said = [f"policy {self.policy}: trained on {plural(self.frames, 'frame')} with the expert's labels"]
         if self.heldout_mse_m2 is not None:
             said.append(f"held-out error {self.heldout_mse_m2:.3g} m2")
-        if self.evaluated:
-            said.append(f"evaluated: placed {self.evaluated['placed']} of {self.evaluated['episodes']}")
         if self.drove:
             drove = self.drove
             said.append(
@@ -89,11 +85,10 @@ def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
     for number in range(plan.config.rounds + 1):
         data = store.get(plan.data(number), machine)
         error = _heldout_error(plan, number, store, machine)
-        evaluated = totals(store.get(plan.evaluation(number), machine)) if plan.config.eval_episodes else None
         drives = number < plan.config.rounds
         drove = totals(store.get(plan.round(number + 1), machine)) if drives else None
         frames = LeRobotDatasetMetadata(f"local/{plan.data(number).digest}", root=data).total_frames
-        yield Line(number, frames, error, drove, evaluated)
+        yield Line(number, frames, error, drove)
 
 
 def _heldout_error(plan: Plan, number: int, store: Store, machine: Machine) -> float | None:

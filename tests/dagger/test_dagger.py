@@ -46,7 +46,6 @@ def settings(tmp_path_factory, tiny_weights):
         "episodes": EPISODES,
         "betas": [0.5, 0.0],
         "max_steps": 15,
-        "eval_episodes": 1,
     }
     file = tmp_path_factory.mktemp("dagger") / "tiny.yaml"
     file.write_text(yaml.safe_dump(fields))
@@ -128,9 +127,9 @@ def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, set
     def stop(*_):
         raise MemoryError
 
-    def note(self, seeds, *others):
+    def note(self, checkpoint, seeds, machine):
         asked.append(list(seeds))
-        return drive(self, seeds, *others)
+        return drive(self, checkpoint, seeds, machine)
 
     monkeypatch.setattr(Round, "_drive", note)
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
