@@ -19,7 +19,7 @@ from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import MADE, SIDECAR
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.training.checkpoints import checkpoint_of
-from lerobot_constructskill.training.heldout import HeldOutError, read_error
+from lerobot_constructskill.training.heldout import HeldOutError, known_error
 from lerobot_constructskill.training.trainers import flush_denormals
 
 ROUNDS = "rounds.json"
@@ -83,20 +83,15 @@ def run_dagger(
 
 def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
     for number in range(plan.config.rounds + 1):
-        data = store.get(plan.data(number), machine)
-        error = _heldout_error(plan, number, store, machine)
+        data, policy = plan.data(number), plan.checkpoint(number)
+        store.get(policy, machine)
+        error = HeldOutError(policy, plan.seed, data)
+        for failure in store.get_all([error], machine).values():
+            logger.warning("Policy %d is not validated: %s", number, failure.said)
         drives = number < plan.config.rounds
         drove = totals(store.get(plan.round(number + 1), machine)) if drives else None
-        frames = LeRobotDatasetMetadata(f"local/{plan.data(number).digest}", root=data).total_frames
-        yield Line(number, frames, error, drove)
-
-
-def _heldout_error(plan: Plan, number: int, store: Store, machine: Machine) -> float | None:
-    store.get(plan.checkpoint(number), machine)
-    error = HeldOutError(plan.checkpoint(number), plan.seed, plan.data(number))
-    for failure in store.get_all([error], machine).values():
-        logger.warning("Policy %d is not validated: %s", number, failure.said)
-    return read_error(store.folder(error)) if store.has(error) else None
+        frames = LeRobotDatasetMetadata(f"local/{data.digest}", root=store.get(data, machine)).total_frames
+        yield Line(number, frames, known_error(error, store), drove)
 
 
 def _copy_data(data: Path, repo_id: str, folder: Path) -> None:

@@ -18,7 +18,8 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
 from lerobot_constructskill.study.runs import EPISODES, FILMED_SEED, VIDEO, Run
 from lerobot_constructskill.study.spec import video_path
-from lerobot_constructskill.study.validate import measured
+from lerobot_constructskill.study.validate import heldout
+from lerobot_constructskill.training.heldout import known_error
 
 
 class Table:
@@ -130,7 +131,7 @@ class Table:
         """Columns for the run's error on what is held out of all demonstrations of its setting, where it is known."""
         if run.checkpoints is None or not self.store.has(run.checkpoints):
             return {}
-        errors = {data.name: measured(run, data, self.store) for data in run.arm.validated_on}
+        errors = {data.name: known_error(heldout(run, data), self.store) for data in run.arm.validated_on}
         errors = {name: error for name, error in errors.items() if error is not None}
         own = errors.get(run.arm.validated_on[0].name)
         return {"heldout_mse_m2": own, "heldout_mse_m2_by_data": json.dumps(errors)} if errors else {}

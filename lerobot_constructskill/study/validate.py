@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.runs import Arm, DataSet, Run
-from lerobot_constructskill.training.heldout import HeldOutError, read_error
+from lerobot_constructskill.training.heldout import HeldOutError
 
 logger = logging.getLogger(__name__)
 
@@ -39,9 +39,3 @@ def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, Da
 def heldout(run: Run, data: DataSet) -> HeldOutError:
     """The held-out error of a run's policy on a set."""
     return HeldOutError(run.checkpoints, run.seed, data.node)
-
-
-def measured(run: Run, data: DataSet, store: Store) -> float | None:
-    """The held-out error in m2; None where it has not been measured."""
-    node = heldout(run, data)
-    return read_error(store.folder(node)) if store.has(node) else None
