@@ -21,7 +21,7 @@ def file_sha256(path: Path) -> str:
 
 
 def known_sha256(path: Path) -> str:
-    """The same of a file that may be asked for often: it is read anew when its size or its time has changed."""
+    """`file_sha256`, cached until the file's size or time of change differs."""
     return _known_sha256(*stamp(path))
 
 
@@ -31,7 +31,7 @@ def _known_sha256(path: Path, size: int, mtime_ns: int) -> str:
 
 
 def stamp(path: Path) -> tuple[Path, int, int]:
-    """A file as it is now: what is known of it holds until its size or its time changes."""
+    """A file's path, size in bytes and time of change in ns: what is known of the file holds until they change."""
     status = path.stat()
     return path, status.st_size, status.st_mtime_ns
 
@@ -60,7 +60,7 @@ def data_sha256(root: Path) -> str:
 
 
 finished_sha256 = cache(data_sha256)
-"""The same of a data set in a store, which does not change."""
+"""`data_sha256` of a data set in a store, cached: it does not change."""
 
 
 @cache
@@ -73,5 +73,5 @@ def installed(package: str) -> str | None:
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Those of some packages that are installed, with their versions."""
+    """The versions of the installed ones of some packages."""
     return {package: found for package in packages if (found := installed(package))}

@@ -1,6 +1,6 @@
-"""Nodes, each told by what makes it, and the store that makes what is missing of them.
+"""Nodes, each found by a digest of what makes it, and the store that makes the missing ones.
 
-<store>/<kind>/<digest>/spec.json   beside whatever the node holds, log.txt among it where something was said
+<store>/<kind>/<digest>/spec.json   beside the content; log.txt after failures
 <store>/logs/<kind>-<digest>.txt    the same log while the node is in the making, and after a failure
 """
 
@@ -76,7 +76,7 @@ class Node:
     kind: ClassVar[str]
     """The store's folder for such nodes."""
     keeps: ClassVar[str | None] = None
-    """A folder of finished parts beside the node in the making, which outlives a kill."""
+    """Name of a folder for finished parts, beside the unfinished node; it outlives a kill."""
     is_passing: ClassVar[bool] = False
     """Whether the store does not keep the node: it is written anew for each node that is made of it."""
     is_single_threaded: bool = False
@@ -285,11 +285,11 @@ class Store:
         log.unlink(missing_ok=True)
 
     def log(self, node: Node) -> Path:
-        """What was said while the node was made; in its own folder once it is there."""
+        """The log of a node: its failures so far. It moves into the node's own folder when that is there."""
         return self.root / "logs" / f"{node.kind}-{node.digest}.txt"
 
     def notes(self, node: Node) -> int:
-        """How many exceptions its log holds while it is not made."""
+        """How many failures the log of a missing node holds."""
         log = self.log(node)
         return sum(map(bool, map(NOTED.match, read_text(log, LONGEST).splitlines()))) if log.exists() else 0
 
@@ -307,7 +307,7 @@ class Store:
         shutil.rmtree(self._doomed(node), ignore_errors=True)
 
     def _tidy(self, node: Node, is_missing: bool) -> None:
-        """Remove what a process left that was killed when the node was whole, or gone, already."""
+        """Remove what a process left that was killed after it had written or discarded the node."""
         shutil.rmtree(self._doomed(node), ignore_errors=True)
         if not is_missing:
             sweep(self.folder(node))
@@ -318,7 +318,7 @@ class Store:
 
 
 def _attempt_quietly(store: Store, node: Node, machine: Machine) -> Failure | None:
-    """In a process of its own, whose bars would mix with those of the others."""
+    """`Store._attempt` in another process, without bars: they would mix with those of the others."""
     with quiet():
         return store._attempt(node, machine)
 

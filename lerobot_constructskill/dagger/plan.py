@@ -1,4 +1,4 @@
-"""A DAgger run before anything runs: every policy, round and data set of it, as nodes that are made of each other."""
+"""The plan of a DAgger run: its policies, rounds and data sets as nodes, before any of them is made."""
 
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,4 +1,4 @@
-"""A DAgger run, step by step; whatever is in the store already is taken from there."""
+"""Runs DAgger step by step; what is in the store already is taken from there."""
 
 import json
 import logging
@@ -29,7 +29,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Line:
-    """What there is to say of a policy, and of the round that it drove.
+    """A policy's results, and those of the round that it drove.
 
     Args:
         policy: its number; policy 0 learnt from the demonstrations alone.

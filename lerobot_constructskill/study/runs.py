@@ -90,7 +90,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Run(Node):
-    """One training seed of an arm: the unit of evidence. Its names are no part of its specification."""
+    """One training seed of an arm, the unit of evidence. Names are not in its specification."""
 
     arm: Arm
     seed: int
@@ -130,7 +130,7 @@ class Run(Node):
 
     @cached_property
     def checkpoints(self) -> Checkpoints | None:
-        """What it trains, perhaps with other seeds."""
+        """The node that holds its checkpoint; None for a reference that is not trained."""
         arm = self.arm
         if arm.learner is None:
             return None
@@ -141,7 +141,7 @@ class Run(Node):
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
-        """The run's digest, and those that it has on other kinds of machine."""
+        """The run's digest, then its digests on other kinds of machine."""
         others = self.arm.learner.elsewhere if self.arm.learner else ()
         return self.digest, *(Run(replace(self.arm, learner=one), self.seed).digest for one in others)
 
@@ -268,7 +268,7 @@ def _write(
 
 
 def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
-    """What every row of a run says."""
+    """The columns that all rows of a run share."""
     arm, weights, stands_on = run.arm, None, {}
     if run.checkpoints and job.store.has(run.checkpoints):
         model = _checkpoint(job, run) / "model.safetensors"
@@ -302,6 +302,6 @@ def _made_on(run: Run, backend: str | None) -> dict[str, str]:
 
 
 def _dataset_sha256(job: Job, run: Run) -> str | None:
-    """Hash of what the run learnt from, or replays."""
+    """Hash of the data set that the run learnt from, or replays."""
     made = run.checkpoints.demonstrations if run.checkpoints else run.inputs.get("demonstrations")
     return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

@@ -12,7 +12,7 @@ logger = logging.getLogger(__name__)
 
 
 def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: Machine) -> None:
-    """Measure whatever has not been measured; an error that cannot be measured is logged and stays unknown.
+    """Measure the held-out errors that are not known yet; those that cannot be measured are logged and stay unknown.
 
     Args:
         runs: those whose policies are validated.
@@ -29,7 +29,7 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, DataSet]]:
-    """What is validated, and on which set of its setting: none that would be made for `others` alone."""
+    """Arms, each with a data set to validate it on; no data set is made that only `others` need."""
     arms = {id(run.arm): run.arm for run in runs}.values()
     own = {arm.demonstrations.node for arm in arms if arm.demonstrations}
     spared = {run.arm.demonstrations.node for run in others if run.arm.demonstrations} - own

@@ -1,4 +1,4 @@
-"""Checkpoints as nodes of a store: what training seeds of a policy make of demonstrations."""
+"""Checkpoints as nodes of a store: a policy, trained on demonstrations with one seed or several."""
 
 import json
 from collections.abc import Mapping
@@ -47,13 +47,13 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoints(Node):
-    """The checkpoints of training seeds that are one computation; that of seed N lies in the folder `seed_N`.
+    """The checkpoints of the training seeds of one computation; the folder `seed_N` holds the checkpoint of seed N.
 
     Args:
         learner: what is trained.
         training: how.
         seeds: every seed of the computation.
-        demonstrations: what it is trained on, every `training.holdout`-th episode excepted.
+        demonstrations: what it is trained on, without every `training.holdout`-th episode.
     """
 
     learner: Learner
@@ -67,7 +67,7 @@ class Checkpoints(Node):
     def holding(
         cls, seed: int, learner: Learner, training: Training, demonstrations: Node, alone: bool = False
     ) -> "Checkpoints":
-        """Those among which is the checkpoint of a seed.
+        """The node that holds the checkpoint of a seed.
 
         Args:
             alone: train the seed by itself, also where its trainer stacks seeds.

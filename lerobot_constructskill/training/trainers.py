@@ -1,4 +1,4 @@
-"""What trains a policy type in a study: the class that its configuration names, or `lerobot-train`."""
+"""Trainers of policy types, and the policy that one trains. By default `lerobot-train` trains."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,10 +26,10 @@ PUBLISHED = ("push_to_hub", "repo_id", "private", "tags", "license")
 
 
 def flush_denormals() -> None:
-    """Have this process take for zero what is too small for a float32's whole precision, in each of torch's threads.
+    """Treat denormal numbers as zero, in all of torch's threads.
 
-    Sharp keypoints underflow, and a core that computes with such numbers trains them several times slower. Call this
-    before torch first works in parallel, be it to hash weights: a thread takes the setting over when it is made.
+    Sharp keypoints underflow, and computing with denormal numbers trains them several times slower. Call this before
+    torch first works in parallel: a thread takes the setting over when it is made.
     """
     torch.set_flush_denormal(True)
 
@@ -43,18 +43,18 @@ class Trainer:
     """Distributions beside LeRobot, torch and those of the policy and the trainer whose versions may show in them."""
 
     def settle(self, config: PreTrainedConfig) -> list[PreTrainedConfig]:
-        """Write out what a configuration leaves to the machine.
+        """Resolve what a configuration leaves to the machine.
 
         Returns:
-            The configuration on this machine, and behind it those of the other kinds of machine. Of a GPU that this
-            machine lacks nothing is known: LeRobot takes the CPU in its place.
+            The configuration on this machine, then those on other kinds of machine. A GPU that this machine lacks is
+            not among them: LeRobot takes the CPU in its place.
         """
         return [config] if config.device == "cpu" else [config, replace(config, device="cpu")]
 
     def stack(self, config: PreTrainedConfig) -> int:
-        """How many seeds are one computation, whose bits may depend on all of them: 0 to 9, 10 to 19 and so on for 10.
+        """How many seeds are trained as one computation: 0 to 9, 10 to 19 and so on for 10.
 
-        `fit` then gets all seeds of such a stack, whichever of them were asked for.
+        `fit` gets all seeds of a stack, because the bits of one may depend on the others.
         """
         return 1
 
@@ -84,7 +84,7 @@ class Trainer:
             held_out: numbers of the episodes that are not trained on.
 
         Returns:
-            What rows say of the checkpoints: name to what they stand on.
+            Versions for the rows beside those of packages, such as the backbone's: name to version.
         """
         raise NotImplementedError
 
