@@ -1,7 +1,6 @@
-"""What code is: of ours the revisions of its rooms, of others' its version and a hash of its source.
+"""Tells which code makes something: our rooms by their revisions, other packages by version and hash of the source.
 
-A policy in development changes all day and its version does not. So its source stands beside the version in whatever
-is found by a digest.
+A policy in development changes all day and its version does not, so digests contain its source as well.
 """
 
 import ast
@@ -15,21 +14,21 @@ from importlib.metadata import packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 
-from lerobot_constructskill.artifacts.digests import file_sha256, installed, stamp
+from lerobot_constructskill.artifacts.digests import installed, known_sha256, stamp
 from lerobot_constructskill.artifacts.revisions import LEFT_OUT, PACKAGE, revisions
 from lerobot_constructskill.errors import MachineError
 
-BY_VERSION = {"lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
+BY_VERSION = {"__main__", "lerobot", "lerobot_constructskill", "lerobot_env_constructskill", *sys.stdlib_module_names}
 """Top-level packages whose source is not hashed: LeRobot's version says enough, and our own code has revisions."""
 
 
 def code_of(*names: str) -> dict[str, str]:
-    """What the code of some modules is, by the name of its distribution.
+    """The code of some modules, by the name of its distribution.
 
-    LeRobot's code is left out, and ours is told by `revisions`. Other code is told by its version, where it is
-    installed, and by the start of a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". Source is every file of the
-    top-level package, meshes and settings too, but for `LEFT_OUT`; and of packages that it imports and that are of
-    the same distribution, or of none. Other distributions that it imports are not told.
+    LeRobot's code is left out, and our code has `revisions`. Other code has its version, where it is installed, and
+    the start of a SHA-256 of its source: "0.1.0, source 2c26b46b68ff". The source is every file of the top-level
+    package, meshes and settings too, without `LEFT_OUT`, and the packages that it imports from the same distribution
+    or from no distribution. Other distributions are left out.
 
     Args:
         names: modules, or classes as `module:class`.
@@ -40,7 +39,7 @@ def code_of(*names: str) -> dict[str, str]:
 
 
 def check_unedited(before: Mapping[str, str], now: Mapping[str, str]) -> None:
-    """Let nothing be written under the name of what some code was before somebody edited it.
+    """Refuse to write a result under the digest of code that has been edited since.
 
     Args:
         before, now: package to version and source.
@@ -62,22 +61,17 @@ def _told(package: str) -> tuple[str, str]:
 
 
 def _source_sha256(package: str) -> str:
-    """Hash the names and bytes of the source of a package, and of those that belong to it, as it is now."""
+    """Hash the names and bytes of a package's source files, and of its helpers'."""
     total = hashlib.sha256()
     for name in sorted(_with_helpers(package)):
         for relative, path in sorted(_files(name).items()):
             total.update(f"{name}/{relative}".encode())
-            total.update(bytes.fromhex(_sha256(*stamp(path))))
+            total.update(bytes.fromhex(known_sha256(path)))
     return total.hexdigest()
 
 
-@cache
-def _sha256(path: Path, size: int, mtime_ns: int) -> str:
-    return file_sha256(path)
-
-
 def _with_helpers(package: str) -> set[str]:
-    """A top-level package and those that belong to it."""
+    """A top-level package and the packages that it imports from its own distribution or from no distribution."""
     found, unread = {package}, [package]
     while unread:
         for path in _files(unread.pop()).values():
@@ -103,7 +97,7 @@ def _imported(path: Path, size: int, mtime_ns: int) -> set[str]:
 
 
 def _distribution(package: str) -> str | None:
-    """The installed distribution of a top-level package.
+    """The installed distribution of a top-level package; None without one.
 
     The metadata of an editable installation may not list its packages; a plugin of LeRobot's is named as its package.
     """
@@ -114,12 +108,12 @@ _distributions = cache(packages_distributions)
 
 
 def _is_written(package: str) -> bool:
-    """Whether somebody wrote a module or package of this name; any folder on the path would pass for one."""
+    """Whether there is source code of this name; any folder on the path is a namespace package without code."""
     return any(path.name in ("__init__.py", f"{package}.py") for path in _files(package).values())
 
 
 def _files(package: str) -> dict[str, Path]:
-    """The files of a top-level package or module, by relative path; none where there is no such thing."""
+    """The files of a top-level package or module, by relative path; empty if it is not there."""
     try:
         spec = find_spec(package)
     except (ImportError, ValueError):  # the latter of `__main__`

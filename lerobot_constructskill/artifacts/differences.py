@@ -1,4 +1,4 @@
-"""What is not as it was when a node was made: packages and rooms by their names, settings by their places."""
+"""Finds what has changed since a node was made: names of packages and rooms, places of settings."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -12,10 +12,10 @@ from lerobot_constructskill.errors import MissingError
 
 
 def differences(before: Mapping[str, Any], node: Node) -> list[str]:
-    """In what a node, or something that it is made of, differs from one that was made before.
+    """What differs between a node, with its inputs, and a node that was made before.
 
     Args:
-        before: the specification of the one that was made, with its lineage.
+        before: the specification of the node that was made, with its lineage.
     """
     return list(dict.fromkeys(_differences(before, node.spec, before.get(LINEAGE, {}), node.lineage)))
 
@@ -45,15 +45,15 @@ def _told(before: Any, now: Any, place: str) -> Iterator[str]:
 
 
 def versions_that_differ(before: Mapping[str, str], now: Mapping[str, str | None]) -> list[str]:
-    """The packages and rooms whose versions differ, of an edited room its file too."""
+    """The packages and rooms whose versions differ; an edited room with its file."""
     return list(_told({name: before.get(name) for name in now}, now, VERSIONS))
 
 
 def outdated(folder: Path) -> list[str]:
-    """In what the code of today differs from the code that made a folder of a store and whatever it is made of.
+    """The packages and rooms that have changed since a folder of a store, or one of its inputs, was made.
 
     Raises:
-        MissingError: there is no such folder, or it is none of a store.
+        MissingError: there is no such folder, or it is not a folder of a store.
         InputError: its specification is damaged.
     """
     if not (folder / SPEC).exists():

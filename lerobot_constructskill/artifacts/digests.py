@@ -20,8 +20,18 @@ def file_sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def known_sha256(path: Path) -> str:
+    """`file_sha256`, cached until the file's size or time of change differs."""
+    return _known_sha256(*stamp(path))
+
+
+@cache
+def _known_sha256(path: Path, size: int, mtime_ns: int) -> str:
+    return file_sha256(path)
+
+
 def stamp(path: Path) -> tuple[Path, int, int]:
-    """A file as it is now: what is known of it holds until its size or its time changes."""
+    """A file's path, size in bytes and time of change in ns: what is known of the file holds until they change."""
     status = path.stat()
     return path, status.st_size, status.st_mtime_ns
 
@@ -50,7 +60,7 @@ def data_sha256(root: Path) -> str:
 
 
 finished_sha256 = cache(data_sha256)
-"""The same of a data set in a store, which does not change."""
+"""`data_sha256` of a data set in a store, cached: it does not change."""
 
 
 @cache
@@ -63,5 +73,5 @@ def installed(package: str) -> str | None:
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Those of some packages that are installed, with their versions."""
+    """The versions of the installed ones of some packages."""
     return {package: found for package in packages if (found := installed(package))}

@@ -1,6 +1,6 @@
-"""A full disk, whatever shape its news arrives in: encoders, Parquet and PyTorch have their own.
+"""Turns errors of a full disk into one sentence.
 
-Only on the outside does every one of them look alike: there is no room left.
+Encoders, Parquet and PyTorch report a full disk in different ways, so the free space is measured.
 """
 
 import errno
@@ -13,25 +13,28 @@ from pathlib import Path
 from lerobot_constructskill.errors import MachineError, UserError
 
 FULL = 1 << 20
-"""Bytes free below which a write that failed is taken to have failed for want of room."""
+"""Free bytes below which a failed write counts as a write to a full disk."""
 
 
 def disk_of(path: Path) -> Path:
-    """The nearest folder of a path that is there."""
+    """The nearest existing folder above a path."""
     return next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
 
 
 def _says_so(error: OSError) -> bool:
-    """NumPy gives no number, and asks for the room before it writes."""
+    """NumPy checks the free space before it writes, and raises an OSError without a number."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT) or "free space" in str(error)
 
 
 @contextmanager
 def room_for(path: Path) -> Iterator[None]:
-    """Turn what the block raises on a full disk into one sentence; `path` is what it writes, before that is removed.
+    """Turn what the block raises on a full disk into one sentence.
+
+    Args:
+        path: what the block writes; it must still be there when the block ends.
 
     Raises:
-        MachineError: the disk is full, or that of temporary files.
+        MachineError: the disk is full, or the disk of temporary files.
     """
     try:
         yield

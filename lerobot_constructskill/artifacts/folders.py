@@ -13,7 +13,7 @@ from lerobot_constructskill.artifacts.locks import locked
 from lerobot_constructskill.errors import TakenError
 
 MARK = ".constructskill"
-"""File that tells our working folders from a user's, and that the process at work holds locked."""
+"""File that marks our working folders; the process at work holds it locked."""
 
 
 @contextmanager
@@ -56,9 +56,9 @@ def staged(root: Path, keep: str | None = None) -> Iterator[Path]:
 
 
 def _open_up(folder: Path) -> None:
-    """Let whoever may read a folder read what is in it, and have all of it on the disk.
+    """Give a folder's content the folder's own read permissions, and write all of it to the disk.
 
-    `tempfile`, by which LeRobot joins videos, lets nobody but their owner read files.
+    LeRobot joins videos by `tempfile`, whose files only their owner can read.
     """
     access = folder.stat().st_mode & 0o777
     for path in folder.rglob("*"):
@@ -69,7 +69,7 @@ def _open_up(folder: Path) -> None:
 
 
 def _to_disk(path: Path) -> None:
-    """Have a file's content, or a folder's names, on the disk: a power cut would leave the new name without it."""
+    """Flush a file's content, or a folder's names, to the disk: after a power cut a new name could have no content."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -78,7 +78,7 @@ def _to_disk(path: Path) -> None:
 
 
 def sweep(root: Path) -> None:
-    """Remove what a process left beside a whole folder that was killed just before it would have done so."""
+    """Remove the working folder beside a whole folder, which a process left that was killed before it cleaned up."""
     partial = _partial(root)
     if (partial / MARK).exists():
         with suppress(TakenError), locked(partial / MARK, taken="It is in use."):
@@ -93,7 +93,7 @@ def _partial(root: Path) -> Path:
 
 
 def _clear(partial: Path, keep: str | None = None) -> None:
-    """Remove all but what is kept and the mark, without which a killed clean-up would not be known as ours."""
+    """Remove all but the kept folder and the mark, which says that the folder is ours if the clean-up is killed."""
     for path in partial.iterdir():
         if path.name == MARK or (path.name == keep and any(path.iterdir())):
             continue
@@ -113,7 +113,7 @@ def write_text(path: Path, text: str) -> None:
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a path beside `path` to write a file to; it becomes `path` when the block ends, whole or not at all.
 
-    What killed processes left of the same file is removed: whoever writes one holds it locked, on any machine.
+    Leftovers of killed processes are removed: a process that writes one holds it locked, on any machine.
 
     Raises:
         MachineError: the disk is full.

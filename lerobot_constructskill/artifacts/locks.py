@@ -15,7 +15,7 @@ def locked(path: Path, taken: str | None = None) -> Iterator[None]:
     """Hold the lock of the file `path`, which the operating system frees however the process ends.
 
     Args:
-        taken: what to say where another process holds it; without it, wait.
+        taken: message of the error if another process holds it; without a message, wait.
 
     Raises:
         TakenError: another process holds it.

@@ -1,4 +1,4 @@
-"""Where attempts run: in this process, in worker processes, or on Ray; the caller sees one `submit`."""
+"""Pools of workers behind one `submit`: this process, worker processes, or Ray."""
 
 import ctypes
 import os
@@ -16,7 +16,7 @@ EXECUTORS = ("processes", "ray")
 
 PR_SET_PDEATHSIG = 1
 
-DIED = "A worker process died, for want of memory perhaps; the same command continues with what is finished."
+DIED = "A worker process died, perhaps out of memory; the same command continues with what is finished."
 
 type Submit = Callable[..., Future]
 
@@ -76,7 +76,7 @@ def be_killed_with_parent() -> None:
 
 
 def _settle() -> None:
-    """Make a worker a good child: one thread, deaf to Ctrl-C, which its parent handles, and dead with its parent."""
+    """Initialise a worker: one thread, no Ctrl-C (its parent handles that), and an end together with its parent."""
     for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -84,7 +84,7 @@ def _settle() -> None:
 
 
 def die_with_parent() -> None:
-    """End this worker process when its parent has ended, whatever either of them is busy with."""
+    """End this worker process as soon as its parent has ended."""
     threading.Thread(target=_outlive_no_parent, daemon=True).start()
 
 

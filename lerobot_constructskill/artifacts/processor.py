@@ -1,4 +1,4 @@
-"""This machine's processor, for whatever says where it was made. Standard library only."""
+"""The name and the maker of this machine's processor. Standard library only."""
 
 import platform
 from functools import cache
@@ -9,7 +9,7 @@ CPUINFO = Path("/proc/cpuinfo")
 
 @cache
 def processor() -> str:
-    """Its name, with family and model, by which makers tell apart what they sell under one name."""
+    """The processor's name, with family and model: makers sell several models under one name."""
     facts = _facts()
     if "model name" not in facts:
         return platform.machine()
@@ -19,7 +19,7 @@ def processor() -> str:
 
 @cache
 def make() -> str:
-    """Its maker, such as AuthenticAMD or GenuineIntel; the architecture where Linux does not tell.
+    """The processor's maker, such as AuthenticAMD or GenuineIntel; the architecture where Linux does not tell.
 
     Makers are free in the last bits of the instructions that approximate reciprocals and inverse square roots (Intel
     64 and AMD64 manuals, RCPPS and RSQRTPS; each allows a relative error of 1.5 * 2^-12).

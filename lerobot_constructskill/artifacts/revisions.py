@@ -1,14 +1,13 @@
-"""What our own code is: a revision for each room that decides bytes, and of an edited room its source.
+"""Tells our own code: a revision for each room that decides bytes, and for an edited room its source.
 
 `revisions.json` keeps for each room its number, the rooms that it stands on, and a hash of each of its files: of the
-syntax tree without docstrings, so that comments and layout do not count. Whoever changes a room raises its number, if
-what it makes has other bytes, or records the new source under the old number, which the tests that the table names
-are there to show:
+syntax tree without docstrings, so that comments and layout do not count. After a change of a room, either raise its
+number, if it makes other bytes, or record the new source under the old number, if the tests that the table names pass:
 
     python -m lerobot_constructskill.artifacts.revisions --raise demos
     python -m lerobot_constructskill.artifacts.revisions --keep demos
 
-A room whose source is not that of the table, for somebody edited it, is told by its source in place of its number.
+Where the source is not the one in the table, because somebody edited it, its hash takes the place of the number.
 """
 
 import argparse
@@ -39,7 +38,7 @@ EDITED = "edited: "
 """Before the file where the source stands in place of a revision."""
 
 BEFORE = "before revisions"
-"""What stands in place of a revision in rows that were made when there were none."""
+"""Stands in place of a revision in rows that are older than revisions."""
 
 
 class Room(TypedDict):
@@ -47,7 +46,7 @@ class Room(TypedDict):
 
     holds: its files and folders, below the package.
     stands_on: rooms without which it makes nothing, whose revisions are told beside its own.
-    takes: rooms that make what it is given; what was given has revisions of its own.
+    takes: rooms that make its inputs; these have revisions of their own.
     held_by: the tests that show whether it makes the same bytes.
     """
 
@@ -142,7 +141,7 @@ def _plain(node: Any) -> Any:
 
 
 def _is_docstring(node: Any) -> bool:
-    """Whether it is a text that stands by itself: of a module, a class, a function, or below a constant."""
+    """Whether a node is a text that stands by itself: the docstring of a module, class, function or constant."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 

@@ -1,6 +1,6 @@
-"""Nodes, each told by what makes it, and the store that makes what is missing of them.
+"""Nodes, each found by a digest of what makes it, and the store that makes the missing ones.
 
-<store>/<kind>/<digest>/spec.json   beside whatever the node holds, log.txt among it where something was said
+<store>/<kind>/<digest>/spec.json   beside the content; log.txt after failures
 <store>/logs/<kind>-<digest>.txt    the same log while the node is in the making, and after a failure
 """
 
@@ -9,7 +9,7 @@ import logging
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import BrokenExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
@@ -20,10 +20,11 @@ from typing import Any, ClassVar, NotRequired, TypedDict
 
 from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.digests import digest
+from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.folders import staged, sweep
 from lerobot_constructskill.artifacts.locks import locked
-from lerobot_constructskill.artifacts.pools import cores, open_pool
-from lerobot_constructskill.errors import InputError, MissingError, TakenError, full_traceback
+from lerobot_constructskill.artifacts.pools import DIED, cores, open_pool
+from lerobot_constructskill.errors import InputError, MachineError, MissingError, TakenError
 from lerobot_constructskill.files import Json, read_text
 from lerobot_constructskill.progress import Progress, quiet
 
@@ -75,9 +76,9 @@ class Node:
     kind: ClassVar[str]
     """The store's folder for such nodes."""
     keeps: ClassVar[str | None] = None
-    """A folder of finished parts beside the node in the making, which outlives a kill."""
+    """Name of a folder for finished parts, beside the unfinished node; it outlives a kill."""
     is_passing: ClassVar[bool] = False
-    """Whether the node is removed as soon as what was made of it is there."""
+    """Whether the store does not keep the node: it is written anew for each node that is made of it."""
     is_single_threaded: bool = False
     """Whether `make` keeps one core busy, so that several nodes are made at the same time."""
     parts: tuple["Node", ...] = ()
@@ -149,59 +150,79 @@ class Store:
             MachineError: code was edited while it was at work, or the disk is full.
             Exception: whatever making a node raises.
         """
-        for one in dict.fromkeys([*self._due(node), node]):  # itself to be tidied up after a kill
-            with self.claim([one]) as missing, ExitStack() as stack:
-                stack.callback(self._discard_passing, one)
+        for one in dict.fromkeys([*self._due(node), node]):  # the node itself to be tidied up after a kill
+            with self.claim([one]) as missing:
                 if missing:
-                    inputs = {name: self.get(other, machine) for name, other in one.inputs.items()}
-                    with self.writing(one) as folder:
-                        one.make(folder, inputs, machine)
+                    self._make(one, machine)
         return self.folder(node)
 
+    def _make(self, node: Node, machine: Machine) -> None:
+        with self.writing(node) as folder:
+            inputs = {name: self._input(one, folder.with_name(name), machine) for name, one in node.inputs.items()}
+            node.make(folder, inputs, machine)
+
+    def _input(self, node: Node, beside: Path, machine: Machine) -> Path:
+        """The folder of an input; a passing one is written beside the node that is made of it."""
+        if not node.is_passing:
+            return self.get(node, machine)
+        node.make(beside, {name: self.get(one, machine) for name, one in node.inputs.items()}, machine)
+        return beside
+
     def _due(self, node: Node) -> list[Node]:
-        """What is missing for a node, in an order in which it can be made."""
+        """What is missing for a node, in an order in which it can be made; the node itself is last."""
         made_of, unseen = {}, [node]
         while unseen:
             one = unseen.pop()
-            if one not in made_of and not self.has(one):
+            if one not in made_of and (one.is_passing or not self.has(one)):
                 made_of[one] = list(one.inputs.values())
                 unseen += made_of[one]
-        return [one for one in TopologicalSorter(made_of).static_order() if one in made_of]
+        order = TopologicalSorter(made_of).static_order()
+        return [one for one in order if one in made_of and not one.is_passing]
 
-    def get_all(self, nodes: Sequence[Node], machine: Machine) -> dict[Node, Exception]:
+    def get_all(self, nodes: Sequence[Node], machine: Machine) -> dict[Node, Failure]:
         """Make what is missing of several nodes, and return why some could not be made; the others are made.
 
         Nodes that keep one core busy are made at the same time, a process for each core.
-
-        Raises:
-            BrokenExecutor: a process died.
         """
         missing = [one for one in dict.fromkeys(nodes) if not self.has(one)]
         beside = [one for one in missing if one.is_single_threaded]
         if min(len(beside), cores()) < 2:
             beside = []
-        failed = {one: error for one in missing if one not in beside and (error := self._try(one, machine))}
-        for one in beside:
-            for other in one.inputs.values():  # or each process would wait for the one that makes it
-                if error := self._try(other, machine):
-                    failed[one] = error
-        if beside := [one for one in beside if one not in failed]:
-            with (
-                open_pool("processes", min(len(beside), cores())) as submit,
-                Progress(total=len(beside), desc=beside[0].kind, unit="node") as bar,
-            ):
-                running = {one: submit(_get_quietly, self, one, machine) for one in beside}
-                for one, future in running.items():
-                    if error := _error_of(future):
-                        failed[one] = error
-                    bar.update()
-        return failed
+        failed: dict[Node, Failure] = {}
+        for one in missing:
+            for due in self._due(one):
+                if due not in beside and (failure := failed.get(due) or self._attempt(due, machine)):
+                    failed[one] = failed[due] = failure
+                    break
+        failed |= self._make_beside([one for one in beside if one not in failed], machine)
+        return {one: failed[one] for one in missing if one in failed}
 
-    def _try(self, node: Node, machine: Machine) -> Exception | None:
+    def _make_beside(self, nodes: Sequence[Node], machine: Machine) -> dict[Node, Failure]:
+        """Make nodes in processes of their own, and return why some could not be made."""
+        if not nodes:
+            return {}
+        failed, died = {}, []
+        with (
+            open_pool("processes", max(2, min(len(nodes), cores()))) as submit,
+            Progress(total=len(nodes), desc=nodes[0].kind, unit="node") as bar,
+        ):
+            for one, future in [(one, submit(_attempt_quietly, self, one, machine)) for one in nodes]:
+                try:
+                    failed[one] = future.result()
+                except BrokenExecutor:
+                    died.append(one)
+                bar.update()
+        if len(nodes) == 1 and died:
+            return {nodes[0]: Failure.of(MachineError(DIED))}
+        for one in died:  # one process ends all of a pool: the others have done nothing
+            failed |= self._make_beside([one], machine)
+        return {one: failure for one, failure in failed.items() if failure}
+
+    def _attempt(self, node: Node, machine: Machine) -> Failure | None:
         try:
             self.get(node, machine)
         except Exception as error:  # whatever a policy, its weights or its data set may raise
-            return error
+            return Failure.of(error)
         return None
 
     def folder(self, node: Node) -> Path:
@@ -264,20 +285,20 @@ class Store:
         log.unlink(missing_ok=True)
 
     def log(self, node: Node) -> Path:
-        """What was said while the node was made; in its own folder once it is there."""
+        """The log of a node: its failures so far. It moves into the node's own folder when that is there."""
         return self.root / "logs" / f"{node.kind}-{node.digest}.txt"
 
     def notes(self, node: Node) -> int:
-        """How many exceptions its log holds while it is not made."""
+        """How many failures the log of a missing node holds."""
         log = self.log(node)
         return sum(map(bool, map(NOTED.match, read_text(log, LONGEST).splitlines()))) if log.exists() else 0
 
-    def note(self, node: Node, error: BaseException) -> None:
-        """Add an exception's whole traceback to the log."""
+    def note(self, node: Node, failure: Failure) -> None:
+        """Add a failure's traceback to the log."""
         log = self.log(node)
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("a", encoding="utf-8") as file:
-            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{full_traceback(error)}\n")
+            file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{failure.traceback}\n")
 
     def discard(self, node: Node) -> None:
         """Remove a node that the caller has claimed, so that it is made anew."""
@@ -285,18 +306,10 @@ class Store:
             self.folder(node).rename(self._doomed(node))  # at once, where removing takes its time
         shutil.rmtree(self._doomed(node), ignore_errors=True)
 
-    def _discard_passing(self, node: Node) -> None:
-        """Remove what a node was made of, where it is not to stay."""
-        for one in node.inputs.values():
-            if one.is_passing:
-                with self.claim([one]):
-                    self.discard(one)
-
     def _tidy(self, node: Node, is_missing: bool) -> None:
-        """Remove what a process left that was killed when the node was whole, or gone, already."""
+        """Remove what a process left that was killed after it had written or discarded the node."""
         shutil.rmtree(self._doomed(node), ignore_errors=True)
         if not is_missing:
-            self._discard_passing(node)
             sweep(self.folder(node))
             self.log(node).unlink(missing_ok=True)
 
@@ -304,20 +317,10 @@ class Store:
         return self.root / node.kind / f".{node.digest}.discarded"
 
 
-def _get_quietly(store: Store, node: Node, machine: Machine) -> None:
-    """In a process of its own, whose bars would mix with those of the others."""
+def _attempt_quietly(store: Store, node: Node, machine: Machine) -> Failure | None:
+    """`Store._attempt` in another process, without bars: they would mix with those of the others."""
     with quiet():
-        store.get(node, machine)
-
-
-def _error_of(future: Future) -> Exception | None:
-    try:
-        future.result()
-    except BrokenExecutor:
-        raise
-    except Exception as error:
-        return error
-    return None
+        return store._attempt(node, machine)
 
 
 def _read_spec(path: Path) -> Spec | None:

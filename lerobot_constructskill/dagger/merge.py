@@ -1,4 +1,4 @@
-"""Demonstrations and rounds as one LeRobotDataset, which says of every frame who acted, and of itself who drove."""
+"""Demonstrations and rounds as one LeRobotDataset. Frames name their actor, the sidecar names each round's policy."""
 
 import json
 import tempfile

@@ -1,4 +1,4 @@
-"""A DAgger run before anything runs: every policy, round and data set of it, as nodes that are made of each other."""
+"""The plan of a DAgger run: its policies, rounds and data sets as nodes, before any of them is made."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,7 +6,7 @@ from typing import Any
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.merge import MergedSet
-from lerobot_constructskill.dagger.rounds import Evaluation, Round
+from lerobot_constructskill.dagger.rounds import Round
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
@@ -23,7 +23,7 @@ class Plan:
     """Policy 0 learns from the demonstrations, policy k from those and k rounds, in each of which the last one drove.
 
     Args:
-        config: the rounds and evaluations. Its base, policy, training and seed are not read.
+        config: the rounds. Its base, policy, training and seed are not read.
         base: the demonstrations to begin with.
         learner: what is trained.
         training: how.
@@ -42,8 +42,7 @@ class Plan:
     def __post_init__(self):
         if self.base.config.labels == "executed":
             raise InputError("The base has executed actions as labels; DAgger needs the expert's.")
-        starts = {"demonstrations": self.base.starts, "rounds": self.config.starts}
-        check_apart(starts | {"evaluation": self.config.eval_starts})
+        check_apart({"demonstrations": self.base.starts, "rounds": self.config.starts})
 
     @classmethod
     def of(cls, config: DaggerConfig) -> "Plan":
@@ -102,10 +101,6 @@ class Plan:
     def _driven_by(self, policy: Checkpoints, number: int) -> Round:
         seeds, config = self.seeds(number), self.config
         return Round(policy, self.base, self.env, seeds, number, config.beta(number), config.patience)
-
-    def evaluation(self, number: int) -> Evaluation:
-        """How policy `number` does by itself."""
-        return Evaluation(self.checkpoint(number), self.base, self.env, self.config.eval_starts)
 
     def seeds(self, number: int) -> range:
         """Seeds of the episodes of a round."""

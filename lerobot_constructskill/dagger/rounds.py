@@ -1,8 +1,8 @@
-"""Episodes that a policy drives, as nodes: a round, which is a LeRobotDataset, and an evaluation."""
+"""A round of DAgger as a node of a store: the episodes that a policy drives, as a LeRobotDataset."""
 
 import json
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -72,25 +72,34 @@ ONE, DRIVEN = Json("a driven episode", DrivenEpisode), Json("a round's episodes"
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation(Node):
-    """Episodes in which a policy acts by itself.
+class Round(Node):
+    """Episodes in which a policy drives and the expert labels every frame; a LeRobotDataset.
 
     Args:
         policy: one checkpoint.
-        base: the demonstrations, for their task and their expert.
+        base: the demonstrations, for their task, their expert and their video encoding.
         env: keywords of `ConstructSkillEnv`.
-        seeds: of the initial states.
+        seeds: seeds of the initial states.
+        number: the round's number, counted from 1.
+        beta: probability that a step executes the expert's action.
+        patience: hopeless steps in a row after which an episode ends.
     """
 
     policy: Checkpoints
     base: Demonstrations
     env: Mapping[str, Any]
     seeds: range
+    number: int
+    beta: float
+    patience: int
 
-    kind = "evaluations"
+    kind = "rounds"
+    keeps = SHARDS
 
     def facts(self) -> dict[str, Any]:
-        return {"seeds": [self.seeds.start, self.seeds.stop], "environment": self.env}
+        base, seeds = self.base.config, [self.seeds.start, self.seeds.stop]
+        how = {"number": self.number, "beta": self.beta, "patience": self.patience}
+        return how | {"seeds": seeds, "environment": self.env, "expert": vars(base.expert), "video": base.video}
 
     def versions(self) -> dict[str, str]:
         task = get_task(self.base.config.task)
@@ -102,57 +111,7 @@ class Evaluation(Node):
         return {"policy": self.policy}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
-        """Drive every episode to its end.
-
-        Raises:
-            MachineError: this machine cannot render, or a simulator died.
-        """
-        never = self.env["episode_length"] + 1
-        alone = Drive(0, beta=0.0, patience=never, pictures=False)
-        outcomes = [DrivenEpisode.of(episode) for episode in self._drive(self.seeds, alone, inputs, machine)]
-        folder.mkdir()
-        self._save(sorted(outcomes, key=lambda outcome: outcome.seed), inputs, folder)
-
-    def _checkpoint(self, inputs: Mapping[str, Path]) -> Path:
-        (seed,) = self.policy.seeds
-        return checkpoint_of(seed, inputs["policy"])
-
-    def _save(self, outcomes: list[DrivenEpisode], inputs: Mapping[str, Path], folder: Path) -> None:
-        weights = self._checkpoint(inputs) / "model.safetensors"
-        driven = Driven(file_sha256(weights) if weights.exists() else None, outcomes)
-        (folder / OUTCOMES).write_text(json.dumps(asdict(driven)) + "\n", encoding="utf-8")
-
-    def _drive(
-        self, seeds: Iterable[int], drive: Drive, inputs: Mapping[str, Path], machine: Machine
-    ) -> Iterator[Episode]:
-        agent = PolicyAgent.from_pretrained(self._checkpoint(inputs), **self.policy.learner.acting)
-        expert = make_expert(get_task(self.base.config.task), self.base.config.expert)
-        yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
-
-
-@dataclass(frozen=True, eq=False)
-class Round(Evaluation):
-    """Episodes in which a policy drives and the expert labels every frame; a LeRobotDataset.
-
-    Args:
-        number: of the round, counted from 1.
-        beta: probability that a step executes the expert's action.
-        patience: hopeless steps in a row after which an episode ends.
-    """
-
-    number: int
-    beta: float
-    patience: int
-
-    kind = "rounds"
-    keeps = SHARDS
-
-    def facts(self) -> dict[str, Any]:
-        how = {"number": self.number, "beta": self.beta, "patience": self.patience}
-        return super().facts() | how | {"expert": vars(self.base.config.expert), "video": self.base.config.video}
-
-    def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
-        """Drive the round: an episode, a shard. Shards that a killed run finished are not driven again.
+        """Drive the round; each episode is a shard. Shards that a killed run finished are not driven again.
 
         Raises:
             InputError: no episode has a frame.
@@ -160,9 +119,9 @@ class Round(Evaluation):
         """
         shards, config = folder.with_name(SHARDS), self.base.config
         task, repo_id = get_task(config.task), f"local/{self.digest}"
+        checkpoint = checkpoint_of(self.policy.seeds.start, inputs["policy"])
         finished = {outcome.seed for outcome in whole(shards, OUTCOME, ONE.read)}
-        drive = Drive(self.number, self.beta, self.patience)
-        for episode in self._drive([seed for seed in self.seeds if seed not in finished], drive, inputs, machine):
+        for episode in self._drive(checkpoint, [seed for seed in self.seeds if seed not in finished], machine):
             with staged(shards / str(episode.seed)) as shard:
                 shard.mkdir()
                 if episode.frames:
@@ -176,11 +135,19 @@ class Round(Evaluation):
             raise InputError(f"Round {self.number} has no frame in which the expert knew a way to success.")
         with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
             aggregate(repo_id, roots, folder, Path(scratch))
-        self._save(outcomes, inputs, folder)
+        weights = checkpoint / "model.safetensors"
+        driven = Driven(file_sha256(weights) if weights.exists() else None, outcomes)
+        (folder / OUTCOMES).write_text(json.dumps(asdict(driven)) + "\n", encoding="utf-8")
+
+    def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[Episode]:
+        agent = PolicyAgent.from_pretrained(checkpoint, **self.policy.learner.acting)
+        expert = make_expert(get_task(self.base.config.task), self.base.config.expert)
+        drive = Drive(self.number, self.beta, self.patience)
+        yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
 
 
 def totals(folder: Path) -> dict[str, Any]:
-    """Sums over the episodes of a round or an evaluation, and the seeds of those without a frame."""
+    """Sums over the episodes of a round, and the seeds of those without a frame."""
     outcomes = DRIVEN.read(folder / OUTCOMES).episodes
     return {
         "episodes": len(outcomes),

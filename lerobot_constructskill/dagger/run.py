@@ -1,6 +1,7 @@
-"""A DAgger run, step by step; whatever is in the store already is taken from there."""
+"""Runs DAgger step by step; what is in the store already is taken from there."""
 
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,39 +17,37 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.rounds import totals
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import MADE, SIDECAR
-from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.errors import plural
 from lerobot_constructskill.training.checkpoints import checkpoint_of
-from lerobot_constructskill.training.heldout import HeldOutError, read_error
+from lerobot_constructskill.training.heldout import HeldOutError, known_error
 from lerobot_constructskill.training.trainers import flush_denormals
 
 ROUNDS = "rounds.json"
 
+logger = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Line:
-    """What there is to say of a policy, and of the round that it drove.
+    """A policy's results, and those of the round that it drove.
 
     Args:
         policy: its number; policy 0 learnt from the demonstrations alone.
         frames: of the data set that it was trained on, each with one expert's label.
-        heldout_mse_m2: its error on that set's held-out episodes, in m2; None for a policy whose chunks need more than
-            single frames.
+        heldout_mse_m2: its error on that set's held-out episodes, in m2; None where it could not be measured, as of a
+            policy whose chunks need more than single frames.
         drove: `rounds.totals` of the round that it drove, None for the last policy.
-        evaluated: the same of its evaluation, None without one.
     """
 
     policy: int
     frames: int
     heldout_mse_m2: float | None
     drove: dict[str, Any] | None
-    evaluated: dict[str, Any] | None
 
     def __str__(self) -> str:
         said = [f"policy {self.policy}: trained on {plural(self.frames, 'frame')} with the expert's labels"]
         if self.heldout_mse_m2 is not None:
             said.append(f"held-out error {self.heldout_mse_m2:.3g} m2")
-        if self.evaluated:
-            said.append(f"evaluated: placed {self.evaluated['placed']} of {self.evaluated['episodes']}")
         if self.drove:
             drove = self.drove
             said.append(
@@ -84,21 +83,15 @@ def run_dagger(
 
 def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
     for number in range(plan.config.rounds + 1):
-        data = store.get(plan.data(number), machine)
-        error = _heldout_error(plan, number, store, machine)
-        evaluated = totals(store.get(plan.evaluation(number), machine)) if plan.config.eval_episodes else None
+        data, policy = plan.data(number), plan.checkpoint(number)
+        store.get(policy, machine)
+        error = HeldOutError(policy, plan.seed, data)
+        for failure in store.get_all([error], machine).values():
+            logger.warning("Policy %d is not validated: %s", number, failure.said)
         drives = number < plan.config.rounds
         drove = totals(store.get(plan.round(number + 1), machine)) if drives else None
-        frames = LeRobotDatasetMetadata(f"local/{plan.data(number).digest}", root=data).total_frames
-        yield Line(number, frames, error, drove, evaluated)
-
-
-def _heldout_error(plan: Plan, number: int, store: Store, machine: Machine) -> float | None:
-    store.get(plan.checkpoint(number), machine)
-    try:
-        return read_error(store.get(HeldOutError(plan.checkpoint(number), plan.seed, plan.data(number)), machine))
-    except InputError:
-        return None
+        frames = LeRobotDatasetMetadata(f"local/{data.digest}", root=store.get(data, machine)).total_frames
+        yield Line(number, frames, known_error(error, store), drove)
 
 
 def _copy_data(data: Path, repo_id: str, folder: Path) -> None:

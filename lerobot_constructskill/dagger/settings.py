@@ -35,8 +35,6 @@ class DaggerConfig:
             last one is also for the rounds that follow. The label is the expert's in every step.
         seed_start: seed of the first episode; the seeds count up through all rounds.
         patience: number of steps in a row, in which the expert knows no way to success, after which an episode ends.
-        eval_episodes: number of episodes in which every policy is also evaluated, the same for all.
-        eval_seed: seed of the first of them.
         workers: processes that simulate.
         together: episodes that run at the same time.
 
@@ -57,8 +55,6 @@ class DaggerConfig:
     betas: Annotated[list[Beta], NotEmpty()] = field(default_factory=lambda: [0.0])
     seed_start: Seed = ROUND_SEED_START
     patience: Steps = 20
-    eval_episodes: Annotated[int, Range(0, 100_000)] = 0
-    eval_seed: Seed = 1000
     workers: Workers = 2
     together: Count = 8
 
@@ -72,11 +68,6 @@ class DaggerConfig:
         """Seeds of the episodes of all rounds."""
         return range(self.seed_start, self.seed_start + self.rounds * self.episodes)
 
-    @property
-    def eval_starts(self) -> range:
-        """Seeds of the evaluation episodes."""
-        return range(self.eval_seed, self.eval_seed + self.eval_episodes)
-
     def beta(self, number: int) -> float:
-        """That of a round, counted from 1."""
+        """The probability of the expert's action in a round, counted from 1."""
         return self.betas[min(number, len(self.betas)) - 1]

@@ -35,8 +35,8 @@ PARTS = "encoded"
 PATCHES = ".patches.npy"
 
 BATCH, BATCHES = 16, {"cuda": 256}
-"""Images that are encoded at a time by default, and on kinds of devices where more are faster. There the last bits of
-a feature depend on the batch, so the description of the features names its size."""
+"""Images a batch: by default, and on devices where larger batches are faster. On these the last bits of a feature
+depend on the batch, so the description of the features names its size."""
 
 
 def load_encoder(
@@ -67,7 +67,7 @@ def load_encoder(
 
 
 def batch_facts(device: torch.device | str, batch_size: int | None = None) -> dict[str, str]:
-    """Return what the description of features says of their batch: its size, on a device of `BATCHES`."""
+    """The size of the batch, as the description of features names it on a device of `BATCHES`; else nothing."""
     kind = torch.device(device).type
     return {"batch_size": str(batch_size or BATCHES[kind])} if kind in BATCHES else {}
 
@@ -100,7 +100,7 @@ def write_feature_set(
     """
     batch_size = batch_size or BATCHES.get(encoder.device.type, BATCH)
     info = info | _source(dataset) | batch_facts(encoder.device, batch_size)
-    # Whatever decides the content is in the folder's name, so nothing made otherwise is taken for a part.
+    # All that decides the content is in the folder's name, so parts of other encoders are never taken.
     parts = folder.with_name(PARTS) / digest({**info, "camera": camera, "patches": patches})
     poses = {name: _column(dataset, name) for name in POSES.values() if points and name in dataset.meta.features}
     found = {point_key(camera): find_points(poses, camera, encoder.crop)} if points else {}

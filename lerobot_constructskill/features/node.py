@@ -79,12 +79,12 @@ class Features(Node):
 
     @property
     def precision(self) -> str:
-        """What heads are trained in, which a study may set apart from what the policy acts in."""
+        """The precision that heads are trained in; a policy may act in another one."""
         return self.config.backbone_trained_precision or self.config.backbone_precision
 
     @property
     def beside(self) -> dict[str, bool]:
-        """Whether there are patch features and points for the readout to learn from."""
+        """Whether the readout needs patch features and points."""
         readout = READOUTS[self.config.readout]
         return {"patches": readout.reads_patches, "points": bool(readout.points)}
 

@@ -1,4 +1,4 @@
-"""Where a camera's picture shows what a readout learns to find, from a data set's privileged state."""
+"""Projects the object, the receptacle and the hand into a camera's picture, from a data set's privileged state."""
 
 from collections.abc import Mapping
 from math import tan
@@ -43,7 +43,7 @@ def find_points(columns: Mapping[str, np.ndarray], camera: str, crop: Crop | Non
 
 
 def _project(camera: Camera, positions: np.ndarray, hands: np.ndarray) -> np.ndarray:
-    """Where a square picture shows world positions (N, 3): (N, 2), half the picture is 1."""
+    """World positions (N, 3), in metres, as positions in a square picture: (N, 2), from -1 to 1."""
     right, down, forward = axes(camera)
     if camera.mount is None:
         offsets = positions - camera.eye

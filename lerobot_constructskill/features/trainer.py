@@ -36,7 +36,7 @@ class FeatureTrainer(Trainer):
     packages = PACKAGES
 
     def settle(self, config: FrozenViTChunkConfig) -> list[FrozenViTChunkConfig]:
-        """Write out what precision `auto` means, here and elsewhere, and which weights there are, None without any.
+        """Resolve the precision `auto`, here and on other machines, and the hash of the weights (None without any).
 
         Raises:
             InputError: its heads are to begin as those of a checkpoint, or no source has weights of the hash it names.
@@ -81,7 +81,7 @@ class FeatureTrainer(Trainer):
 
 
 def _backbone_line(policy: FrozenViTChunkPolicy) -> str:
-    """What the backbone is, whose weights are none of the checkpoint's."""
+    """Describe the backbone, whose weights are not in the checkpoint."""
     record, precision = policy.encoder_record, policy.config.backbone_precision
     crossed = f", trained in {record.precision}" if record.precision != precision else ""
     return f"{record.source}, SHA-256 {record.sha256[:12]}, {precision}{crossed}"

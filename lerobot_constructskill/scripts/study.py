@@ -72,7 +72,7 @@ def study(config: StudyConfig) -> str:
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
-        why, log = table.episodes(failed[0])[0].error, store.folder(failed[0]) / LOG
+        why, log = table.made(failed[0])[0].error, store.folder(failed[0]) / LOG
         raise InputError(f"No run succeeded; the first of {made} failed with: {why} (log: {log})")
     lacking = f", {len(failed)} of them failed (why: --status=true)" if failed else ""
     left = f", {len(missing)} missing" if missing else ""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from annotated_types import Ge
+from annotated_types import Ge, Lt
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
@@ -32,9 +32,10 @@ NOT_RUN = "not_run"
 ERRORS = Json("held-out errors in m2, data set to error", dict[str, float])
 
 
-class _Known(TypedDict, total=False):
-    machine: str
+WALL_TIME = "wall time, s"
+"""Entry of `PROVENANCE`: how long the sessions of a study took, added up."""
 
+_Known = TypedDict("_Known", {"machine": str, WALL_TIME: Annotated[float, Ge(0), Lt(float("inf"))]}, total=False)
 
 KNOWN = Json("what is known of a study's making", _Known)
 """Of the file `PROVENANCE`."""

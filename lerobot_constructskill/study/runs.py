@@ -5,19 +5,18 @@
 """
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from errno import EDQUOT, EIO, EMFILE, ENFILE, ENOLCK, ENOMEM, ENOSPC, EROFS, ESTALE, ETIMEDOUT
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-import httpx
 import torch
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, finished_sha256, versions
+from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Machine, Node, Store
 from lerobot_constructskill.contract import get_task
@@ -25,16 +24,15 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
-from lerobot_constructskill.errors import MachineError, TakenError, kind_of
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
-from lerobot_constructskill.study.timing import DEMONSTRATIONS, EVALUATION, ROUNDS, TRAINING, timed
+from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of
 from lerobot_constructskill.training.recipe import FACTS, SAID, Training
-from lerobot_constructskill.training.trainers import OF_THE_MACHINE, Learner
+from lerobot_constructskill.training.trainers import Learner
 
 EPISODES, VIDEO, CHECKPOINT = "episodes.parquet", "video.mp4", "checkpoint"
 
@@ -42,9 +40,6 @@ FILMED_SEED = 0
 
 TRIES = 3
 """Times that the machine may fail a run before that is the run's result."""
-
-ERRNOS = (ENOSPC, EDQUOT, EROFS, EIO, EMFILE, ENFILE, ENOMEM, ESTALE, ENOLCK, ETIMEDOUT)
-"""What an `OSError` says of the machine, its disks and its network."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +90,7 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class Run(Node):
-    """One training seed of an arm: the unit of evidence. Its names are no part of its specification."""
+    """One training seed of an arm, the unit of evidence. Names are not in its specification."""
 
     arm: Arm
     seed: int
@@ -135,7 +130,7 @@ class Run(Node):
 
     @cached_property
     def checkpoints(self) -> Checkpoints | None:
-        """What it trains, perhaps with other seeds."""
+        """The node that holds its checkpoint; None for a reference that is not trained."""
         arm = self.arm
         if arm.learner is None:
             return None
@@ -146,7 +141,7 @@ class Run(Node):
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
-        """The run's digest, and those that it has on other kinds of machine."""
+        """The run's digest, then its digests on other kinds of machine."""
         others = self.arm.learner.elsewhere if self.arm.learner else ()
         return self.digest, *(Run(replace(self.arm, learner=one), self.seed).digest for one in others)
 
@@ -171,91 +166,60 @@ class Job:
 def make_runs(job: Job) -> Iterator[Run]:
     """Make the runs of a job that nobody has made yet, and yield each as soon as its folder is there.
 
-    A run that fails has a folder as well: one row that says why, and a log with the traceback.
+    A run that fails has a folder as well: one row that says why, and a log with the traceback. A run that the machine
+    fails has none until it has failed `TRIES` times, so that nothing waits for ever for a machine that cannot do its
+    part.
+
+    Raises:
+        MachineError: the machine failed a run; all others are made.
     """
     with job.store.claim(job.runs) as claimed:
         yield from (run for run in job.runs if run not in claimed)
-        runs = [run for run in job.runs if run in claimed]
-        failed = _make_inputs(job, runs)
-        for run, error in failed.items():
-            yield _write_failed(job, run, error)
+        again: list[Failure] = []
+        for run, outcome in _outcomes(job, [run for run in job.runs if run in claimed]):
+            if isinstance(outcome, Failure) and not _write_failed(job, run, outcome):
+                again.append(outcome)
+            else:
+                yield run
+    if again:
+        raise again[0].error()
+
+
+def _outcomes(job: Job, runs: Sequence[Run]) -> Iterator[tuple[Run, Failure | None]]:
+    """What came of each run: None where it is written, else why it is not."""
+    if not runs:
+        return
+    drawn = {run: run.arm.demonstrations.node for run in runs if run.arm.demonstrations}
+    failed = _lost(job, drawn)
+    with timed(job.times, runs[0].arm.id, len(runs)):
+        trained = {run: run.checkpoints for run in runs if run.checkpoints and run not in failed}
+        failed |= _lost(job, trained)
+        yield from failed.items()
         yield from _evaluate(job, [run for run in runs if run not in failed])
 
 
-def _make_inputs(job: Job, runs: Sequence[Run]) -> dict[Run, Exception]:
-    """Make what runs are made of, and return why some of them cannot be made."""
-    failed: dict[Run, Exception] = {}
-    for stage in (DEMONSTRATIONS, TRAINING):
-        wanted = {run: node for run in runs if run not in failed and (node := _wanted(run, stage))}
-        missing = [run for run, node in wanted.items() if not job.store.has(node)]
-        if missing:
-            arm = missing[0].arm
-            told = (ROUNDS if arm.rounds else TRAINING, arm.id, len(missing)) if stage == TRAINING else (stage,)
-            with timed(job.times, *told):
-                lost = job.store.get_all([wanted[run] for run in missing], job.machine)
-            failed |= {run: lost[wanted[run]] for run in missing if wanted[run] in lost}
-    return _without_machines(job, failed)
+def _lost(job: Job, nodes: Mapping[Run, Node]) -> dict[Run, Failure]:
+    """Make a node for each run, and return why some could not be made."""
+    failed = job.store.get_all([*nodes.values()], job.machine)
+    return {run: failed[node] for run, node in nodes.items() if node in failed}
 
 
-def _wanted(run: Run, stage: str) -> Node | None:
-    """What has to be there for a run at the end of a stage."""
-    if stage == TRAINING:
-        return run.checkpoints
-    return run.arm.demonstrations and run.arm.demonstrations.node
-
-
-def _without_machines(job: Job, failed: dict[Run, Exception]) -> dict[Run, Exception]:
-    """Return errors, which are results of their runs; raise those of the machine (disk, network, memory).
-
-    An error that comes back every time is a result: after `TRIES` times it is returned as any other error is, so that
-    nothing waits for ever for a machine that cannot do its part.
-    """
-    of_machine = {run: error for run, error in failed.items() if _is_of_the_machine(error)}
-    if any(job.store.notes(run) < TRIES - 1 for run in of_machine):
-        for run, error in of_machine.items():
-            job.store.note(run, error)
-        raise next(iter(of_machine.values()))
-    others = {run: error for run, error in of_machine.items() if not isinstance(error, MachineError)}
-    return failed | {run: MachineError(f"{type(error).__name__}: {error}") for run, error in others.items()}
-
-
-def _is_of_the_machine(error: Exception) -> bool:
-    causes = [error, *_causes(error)]
-    return (
-        isinstance(error, TakenError | MachineError | MemoryError)
-        or any(isinstance(one, ConnectionError | TimeoutError | httpx.HTTPError) for one in causes)
-        or any(isinstance(one, OSError) and one.errno in ERRNOS for one in causes)
-        or any(isinstance(one, RuntimeError) and any(words in str(one) for words in OF_THE_MACHINE) for one in causes)
-    )
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    while (error := error.__cause__ or error.__context__) is not None:
-        yield error
-
-
-def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[Run]:
-    ready = []
-    for run, agent in [(run, caught(_agent, job, run)) for run in runs]:
-        if isinstance(agent, Exception):
-            yield _write_failed(job, run, _without_machines(job, {run: agent})[run])
-        else:
-            ready.append((run, agent))
-    if not ready:
+def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[tuple[Run, Failure | None]]:
+    made = {run: caught(_agent, job, run) for run in runs}
+    yield from ((run, Failure.of(agent)) for run, agent in made.items() if isinstance(agent, Exception))
+    agents = {run: agent for run, agent in made.items() if not isinstance(agent, Exception)}
+    if not agents:
         return
-    runs, agents = zip(*ready, strict=True)
+    runs = [*agents]
     arm = runs[0].arm  # in the environment and in how it is evaluated, one is like the other
     first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
     filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
     film = FirstEpisode(next(iter(filmed), None))
     how = {"on_step": film.add, "filmed": filmed, "n_workers": job.machine.simulators}
-    with timed(job.times, EVALUATION, arm.id, len(runs)):
-        for number, rollout in roll_out(agents, arm.env, range(first, first + count), **how):
-            run, error = runs[number], rollout.error
-            if error is not None:
-                yield _write_failed(job, run, _without_machines(job, {run: error})[run])
-            else:
-                yield _write_finished(job, run, rollout, partial(film.write, number))
+    for number, rollout in roll_out([*agents.values()], arm.env, range(first, first + count), **how):
+        if rollout.error is None:
+            _write_finished(job, runs[number], rollout, partial(film.write, number))
+        yield runs[number], rollout.error and Failure.of(rollout.error)
 
 
 def _agent(job: Job, run: Run) -> Agent:
@@ -271,16 +235,19 @@ def _checkpoint(job: Job, run: Run) -> Path:
     return checkpoint_of(run.seed, job.store.folder(run.checkpoints))
 
 
-def _write_finished(job: Job, run: Run, rollout: Rollout, write_video) -> Run:
+def _write_finished(job: Job, run: Run, rollout: Rollout, write_video: Callable[[Path], None]) -> None:
     row = _row(job, run, rollout.backend)
     rows = [row.filled(episode, i) for i, episode in enumerate(rollout.episodes)]
-    return _write(job, run, rows, write_video, rollout.recordings(run.arm.env))
+    _write(job, run, rows, write_video, rollout.recordings(run.arm.env))
 
 
-def _write_failed(job: Job, run: Run, error: Exception) -> Run:
-    job.store.note(run, error)
-    said = " ".join(f"{type(error).__name__}: {error}".split())
-    return _write(job, run, [replace(_row(job, run), error_kind=kind_of(error), error=said)])
+def _write_failed(job: Job, run: Run, failure: Failure) -> bool:
+    """Write a run that failed; False where it is to be tried again and nothing is written."""
+    job.store.note(run, failure)
+    if failure.is_of_the_machine and job.store.notes(run) < TRIES:
+        return False
+    _write(job, run, [replace(_row(job, run), error_kind=failure.kind, error=failure.said)])
+    return True
 
 
 def _write(
@@ -289,7 +256,7 @@ def _write(
     rows: list[EpisodeRow],
     write_video: Callable[[Path], None] = lambda path: None,
     recordings: Sequence[Episode] = (),
-) -> Run:
+) -> None:
     with job.store.writing(run) as folder:
         folder.mkdir()
         write_rows(rows, folder / EPISODES, EpisodeRow)
@@ -298,11 +265,10 @@ def _write(
         write_video(folder / VIDEO)
         if run.checkpoints and job.store.has(run.checkpoints):
             (folder / CHECKPOINT).symlink_to(Path("..", "..") / _checkpoint(job, run).relative_to(job.store.root))
-    return run
 
 
 def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
-    """What every row of a run says."""
+    """The columns that all rows of a run share."""
     arm, weights, stands_on = run.arm, None, {}
     if run.checkpoints and job.store.has(run.checkpoints):
         model = _checkpoint(job, run) / "model.safetensors"
@@ -325,16 +291,17 @@ def _made_on(run: Run, backend: str | None) -> dict[str, str]:
     """The processor that made a row, and the graphics card where the policy or the renderer used one.
 
     Args:
-        backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
+        backend: what simulated and rendered, as `ConstructSkillEnv.backend`. A run that failed has none, and names no
+            card, for a card that fails does not tell its name.
     """
-    device = run.arm.learner.places["device"] if run.arm.learner else None
-    acts = (device or "").startswith("cuda")
-    if not acts and "cuda" not in (backend or ""):
+    device = str(run.arm.learner.config.device) if run.arm.learner else ""
+    acts = device.startswith("cuda")
+    if backend is None or not (acts or "cuda" in backend):
         return {"processor": processor()}
     return {"processor": processor(), "card": torch.cuda.get_device_name(device if acts else None)}
 
 
 def _dataset_sha256(job: Job, run: Run) -> str | None:
-    """Hash of what the run learnt from, or replays."""
+    """Hash of the data set that the run learnt from, or replays."""
     made = run.checkpoints.demonstrations if run.checkpoints else run.inputs.get("demonstrations")
     return finished_sha256(job.store.folder(made)) if made and job.store.has(made) else None

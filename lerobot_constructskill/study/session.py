@@ -2,7 +2,6 @@
 
 import json
 import logging
-import math
 import os
 import time
 from collections.abc import Iterator, Sequence
@@ -21,11 +20,10 @@ from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY
+from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY, WALL_TIME
 from lerobot_constructskill.study.runs import Job, Run, make_runs
 from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import seconds_by_stage
 from lerobot_constructskill.study.validate import validate
 from lerobot_constructskill.training.trainers import flush_denormals
 
@@ -51,24 +49,26 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         table = Table(root, runs, store)
         _check_nothing_is_lost(table)
         write_text(root / STUDY, text)
-        for run in table.failed() if options.retry_failed else []:
-            if run in chosen:
-                table.forget_failure(run)
-        missing = [run for run in chosen if table.episodes(run) is None]
+        facts = root / PROVENANCE
+        earlier, start = KNOWN.read(facts) if facts.exists() else {}, time.monotonic()
         for run in chosen:
-            if run not in missing:
+            if options.retry_failed:
+                table.forget_failure(run)
+            elif table.made(run):
                 with store.claim([run]):  # one by one: each holds a file open
                     pass  # which tidies up after a process that was killed when it was whole
+        missing = [run for run in chosen if table.made(run) is None]
         table.write()
-        earlier, before, start = _provenance(root), seconds_by_stage(root), time.monotonic()
         with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:
             for run in _execute(_jobs(missing, root, store, options), options):
                 table.write()
-                _write_provenance(root, earlier, before, time.monotonic() - start)
+                _write_provenance(root, earlier, time.monotonic() - start)
                 progress.update()
                 progress.set_postfix_str(run.id)
-        validate(chosen, [run for run in runs if run not in chosen], store, Machine(options.workers))
-        table.write_anew()
+        asked_for = {run.id for run in chosen}
+        validate(chosen, [run for run in runs if run.id not in asked_for], store, Machine(options.workers))
+        table.read_again()
+        table.write()
         return table
 
 
@@ -116,15 +116,16 @@ def _execute(jobs: Iterator[Job], options: Options) -> Iterator[Run]:
 
         with open_pool(options.executor, options.workers) as submit:
             for future in as_completed([submit(_make_all, job) for job in jobs]):
-                with _noted(stopped):
-                    yield from future.result()
+                made, lost = future.result()
+                stopped += lost
+                yield from made
     if stopped:
         raise stopped[0]
 
 
 @contextmanager
 def _noted(stopped: list[Exception]) -> Iterator[None]:
-    """Put what stops one job where it is found at the end."""
+    """Add what the machine does to one job to a list, and go on with the next one."""
     try:
         yield
     except (OSError, MemoryError, RuntimeError) as error:
@@ -134,42 +135,27 @@ def _noted(stopped: list[Exception]) -> Iterator[None]:
         stopped.append(error)
 
 
-def _make_all(job: Job) -> list[Run]:
+def _make_all(job: Job) -> tuple[list[Run], list[Exception]]:
+    """In another process: the runs that were made, and what stopped the others."""
     flush_denormals()
     load_plugins()  # another machine does not know other packages' references yet
-    return list(make_runs(job))
+    made, stopped = [], []
+    with _noted(stopped):
+        for run in make_runs(job):
+            made.append(run)
+    return made, stopped
 
 
-def _provenance(root: Path) -> dict[str, Any]:
-    """What earlier sessions of the study said, each up to the last run that it finished.
-
-    Raises:
-        InputError: it is damaged, or says of seconds what is no number.
-    """
-    path = root / PROVENANCE
-    facts = {"machine": ""} | (KNOWN.read(path) if path.exists() else {})
-    if bad := [name for name, value in facts.items() if name.endswith(", s") and not _is_time(value)]:
-        raise InputError(f"'{path}': '{bad[0]}' must be a number of seconds, not {facts[bad[0]]!r}.")
-    return facts
-
-
-def _is_time(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
-
-
-def _write_provenance(root: Path, earlier: dict[str, Any], before: dict[str, float], seconds: float) -> None:
+def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> None:
     """Say where the study ran, on every machine, and for how long in all; what else it says stays.
 
     Args:
-        earlier: what it said when this session began. A published folder has no timings, so its seconds stand there.
-        before: the timings of then.
+        earlier: what it said when this session began.
+        seconds: how long this session has taken.
     """
-    this = {"wall time, s": seconds}
-    for stage, total in seconds_by_stage(root).items():
-        this[f"of which {stage}, s"] = total - before.get(stage, 0)
-    machines = [*earlier["machine"].split("; "), f"{os.cpu_count()} cores, {processor()}"]
+    machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
     facts = earlier | {
-        **{name: round(earlier.get(name, 0) + seconds) for name, seconds in this.items()},
+        WALL_TIME: round(earlier.get(WALL_TIME, 0) + seconds),
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
     }
     write_text(root / PROVENANCE, json.dumps(facts, indent=2) + "\n")

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 from lerobot_constructskill.artifacts.differences import differences, versions_that_differ
@@ -11,7 +11,7 @@ from lerobot_constructskill.artifacts.store import LOG
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import EVALUATION, ROUNDS, TRAINING, seconds_per_run
+from lerobot_constructskill.study.timing import seconds_per_run
 
 SHOWN = 3
 """Changes that are named; more are counted."""
@@ -24,25 +24,21 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
         chosen: those that the command is asked for.
         retry_failed: whether it makes failed runs again.
     """
-    due = [run for run in chosen if (rows := table.episodes(run)) is None or (retry_failed and rows[0].error_kind)]
-    lines = []
-    for name, runs in groupby(chosen, key=_arm):
-        runs = list(runs)
+    due = [run for run in chosen if (rows := table.made(run)) is None or (retry_failed and rows[0].error_kind)]
+    lines, took = [], seconds_per_run(table.root)
+    for name, alike in groupby(chosen, key=lambda run: run.arm.id):
+        runs = list(alike)
         lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
         if own := [run for run in due if run in runs]:
-            lines.append(f"    to make: {_seeds(own)}, {_time(table, own)}")
-    return "\n".join([*lines, _total(table, due)])
-
-
-def _arm(run: Run) -> str:
-    return run.arm.id
+            lines.append(f"    to make: {_seeds(own)}, {_time(own, took)}")
+    return "\n".join([*lines, _total(table, due, took)])
 
 
 def _counts(table: Table, runs: Sequence[Run]) -> str:
-    made = [rows for run in runs if (rows := table.episodes(run))]
+    made = [rows for run in runs if (rows := table.made(run))]
     failed = sum(bool(rows[0].error_kind) for rows in made)
     counts = f"{len(made) - failed} finished, {failed} failed, {len(runs) - len(made)} missing"
-    changes = Counter(filter(None, (_changed(table, run) for run in runs if not table.episodes(run))))
+    changes = Counter(filter(None, (_changed(table, run) for run in runs if not table.made(run))))
     told = [f"{number} made before with another {what}" for what, number in changes.items()]
     return f"{counts} ({'; '.join(told)})" if told else counts
 
@@ -66,7 +62,7 @@ def _changed(table: Table, run: Run) -> str | None:
 
 def _failures(table: Table, runs: Sequence[Run]) -> list[str]:
     """A line for each reason."""
-    failed = [(run, rows[0]) for run in runs if (rows := table.episodes(run)) and rows[0].error_kind]
+    failed = [(run, rows[0]) for run in runs if (rows := table.made(run)) and rows[0].error_kind]
     lines = []
     for (kind, error), alike in groupby(failed, key=lambda one: (one[1].error_kind, one[1].error)):
         own = [run for run, _ in alike]
@@ -79,36 +75,21 @@ def _seeds(runs: Sequence[Run]) -> str:
     return f"{'seed' if len(runs) == 1 else 'seeds'} {', '.join(str(run.seed) for run in runs)}"
 
 
-def _seconds(table: Table, runs: Sequence[Run]) -> float | None:
-    """How long runs of one arm take, by how long its last ones took in this folder; None if that is not known."""
-    took = seconds_per_run(table.root).get(_arm(runs[0]), {})
-    untrained = [run for run in runs if run.checkpoints and not table.store.has(run.checkpoints)]
-    training = ROUNDS if runs[0].arm.rounds else TRAINING
-    if EVALUATION not in took or (untrained and training not in took):
-        return None
-    return len(runs) * took[EVALUATION] + (len(untrained) * took[training] if untrained else 0)
+def _time(runs: Sequence[Run], took: Mapping[str, float]) -> str:
+    """How long runs take, by how long the last ones of their variants took in this folder."""
+    known = [took[run.arm.id] for run in runs if run.arm.id in took]
+    if not known:
+        return "time unknown"
+    seconds, more = sum(known), " and some of unknown time" if len(known) < len(runs) else ""
+    units = ((3600, "h"), (60, "min"), (1, "s"))
+    size, unit = next(one for one in units if seconds >= 1.5 * one[0] or one[0] == 1)
+    return f"about {seconds / size:.0f} {unit}{more}"
 
 
-def _time(table: Table, runs: Sequence[Run]) -> str:
-    seconds = _seconds(table, runs)
-    return "time unknown" if seconds is None else _about(seconds)
-
-
-def _about(seconds: float) -> str:
-    for size, unit in ((3600, "h"), (60, "min")):
-        if seconds >= 1.5 * size:
-            return f"about {seconds / size:.0f} {unit}"
-    return f"about {seconds:.0f} s"
-
-
-def _total(table: Table, due: Sequence[Run]) -> str:
+def _total(table: Table, due: Sequence[Run], took: Mapping[str, float]) -> str:
     if not due:
         return "Nothing to make."
-    times = [_seconds(table, list(runs)) for _, runs in groupby(due, key=_arm)]
-    known = [seconds for seconds in times if seconds is not None]
-    time = _about(sum(known)) if known else "time unknown"
-    beside = " and some of unknown time" if known and len(known) < len(times) else ""
     used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
     absent = [name for name, data in used.items() if not table.store.has(data.node)]
     first = f"; first the demonstrations: {', '.join(absent)}" if absent else ""
-    return f"To make: {plural(len(due), 'run')}, {time}{beside}{first}"
+    return f"To make: {plural(len(due), 'run')}, {_time(due, took)}{first}"

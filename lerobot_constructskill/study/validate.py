@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.runs import Arm, DataSet, Run
-from lerobot_constructskill.training.heldout import HeldOutError, read_error
+from lerobot_constructskill.training.heldout import HeldOutError
 
 logger = logging.getLogger(__name__)
 
 
 def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: Machine) -> None:
-    """Measure whatever has not been measured; an error that cannot be measured is logged and stays unknown.
+    """Measure the held-out errors that are not known yet; those that cannot be measured are logged and stay unknown.
 
     Args:
         runs: those whose policies are validated.
@@ -22,14 +22,14 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
         failed = store.get_all(nodes, machine)
-        for said in dict.fromkeys(map(str, failed.values())):
+        for said in dict.fromkeys(failure.said for failure in failed.values()):
             logger.warning("%s is not validated on %s: %s", arm.id, data.name, said)
-        for node, error in failed.items():
-            store.note(node, error)
+        for node, failure in failed.items():
+            store.note(node, failure)
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, DataSet]]:
-    """What is validated, and on which set of its setting: none that would be made for `others` alone."""
+    """Arms, each with a data set to validate it on; no data set is made that only `others` need."""
     arms = {id(run.arm): run.arm for run in runs}.values()
     own = {arm.demonstrations.node for arm in arms if arm.demonstrations}
     spared = {run.arm.demonstrations.node for run in others if run.arm.demonstrations} - own
@@ -39,9 +39,3 @@ def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, Da
 def heldout(run: Run, data: DataSet) -> HeldOutError:
     """The held-out error of a run's policy on a set."""
     return HeldOutError(run.checkpoints, run.seed, data.node)
-
-
-def measured(run: Run, data: DataSet, store: Store) -> float | None:
-    """The held-out error in m2; None where it has not been measured."""
-    node = heldout(run, data)
-    return read_error(store.folder(node)) if store.has(node) else None

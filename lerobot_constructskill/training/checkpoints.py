@@ -1,7 +1,8 @@
-"""Checkpoints as nodes of a store: what training seeds of a policy make of demonstrations."""
+"""Checkpoints as nodes of a store: a policy, trained on demonstrations with one seed or several."""
 
 import json
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -46,13 +47,13 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Checkpoints(Node):
-    """The checkpoints of training seeds that are one computation; that of seed N lies in the folder `seed_N`.
+    """The checkpoints of the training seeds of one computation; the folder `seed_N` holds the checkpoint of seed N.
 
     Args:
         learner: what is trained.
         training: how.
         seeds: every seed of the computation.
-        demonstrations: what it is trained on, every `training.holdout`-th episode excepted.
+        demonstrations: what it is trained on, without every `training.holdout`-th episode.
     """
 
     learner: Learner
@@ -66,7 +67,7 @@ class Checkpoints(Node):
     def holding(
         cls, seed: int, learner: Learner, training: Training, demonstrations: Node, alone: bool = False
     ) -> "Checkpoints":
-        """Those among which is the checkpoint of a seed.
+        """The node that holds the checkpoint of a seed.
 
         Args:
             alone: train the seed by itself, also where its trainer stacks seeds.
@@ -88,7 +89,7 @@ class Checkpoints(Node):
 
     @cached_property
     def inputs(self) -> dict[str, Node]:
-        return {"data": self.learner.trainer.learns_from(self.learner.here, self.demonstrations)}
+        return {"data": self.learner.trainer.learns_from(self.learner.config, self.demonstrations)}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Train the seeds. Raises whatever the trainer raises."""
@@ -96,7 +97,8 @@ class Checkpoints(Node):
         dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
         kept_out = held_out(dataset.num_episodes, self.training.holdout)
         folder.mkdir()
-        made_of = self.learner.trainer.fit(self.learner.here, dataset, self.seeds, self.training, kept_out, folder)
+        config = deepcopy(self.learner.config)  # which a trainer may change
+        made_of = self.learner.trainer.fit(config, dataset, self.seeds, self.training, kept_out, folder)
         for seed in self.seeds:
             facts = {"seed": seed, "training": asdict(self.training), "made_of": made_of}
             (checkpoint_of(seed, folder) / FACTS).write_text(json.dumps(facts) + "\n", encoding="utf-8")

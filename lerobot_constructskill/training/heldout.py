@@ -10,7 +10,7 @@ from typing import Any
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.artifacts.store import Machine, Node, Store
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.rollout.heldout import heldout_mse
@@ -40,7 +40,7 @@ class HeldOutError(Node):
     @cached_property
     def inputs(self) -> dict[str, Node]:
         learner = self.checkpoints.learner
-        data = learner.trainer.learns_from(learner.here, self.demonstrations)
+        data = learner.trainer.learns_from(learner.config, self.demonstrations)
         return {"checkpoint": self.checkpoints, "data": data}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
@@ -53,6 +53,6 @@ class HeldOutError(Node):
         (folder / FILE).write_text(json.dumps({"mse_m2": error}) + "\n", encoding="utf-8")
 
 
-def read_error(folder: Path) -> float | None:
-    """The error in m2 in the folder of a `HeldOutError`; None where no episode was held out."""
-    return ERROR.read(folder / FILE)["mse_m2"]
+def known_error(node: HeldOutError, store: Store) -> float | None:
+    """The error in m2; None where it has not been measured, or no episode was held out."""
+    return ERROR.read(store.folder(node) / FILE)["mse_m2"] if store.has(node) else None

@@ -1,7 +1,6 @@
 """Trains any LeRobot policy by LeRobot's own command, `lerobot-train`, in a process of its own."""
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -13,11 +12,12 @@ import draccus
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 
+from lerobot_constructskill.artifacts.failures import NO_MEMORY
 from lerobot_constructskill.artifacts.pools import be_killed_with_parent, cores
 from lerobot_constructskill.errors import MachineError
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 from lerobot_constructskill.training.recipe import Training
-from lerobot_constructskill.training.trainers import NO_MEMORY, OF_THE_MACHINE, Trainer
+from lerobot_constructskill.training.trainers import Trainer
 
 KILLED = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 """Signals that a user sends, or the kernel when memory runs out."""
@@ -64,7 +64,7 @@ class LeRobotTrainer(Trainer):
             f"--num_workers={min(cores() - 1, LOADERS)}",
         ]
         for seed in seeds:
-            output, log = folder.with_name(f"lerobot-train-{os.getpid()}"), folder.with_name(LOG)
+            output, log = folder.with_name(f"lerobot-train-{seed}"), folder.with_name(LOG)
             _call([*command, f"--seed={seed}", f"--output_dir={output}"], log)
             (output / LAST_CHECKPOINT).resolve().rename(folder / f"seed_{seed}")
             log.rename(folder / f"seed_{seed}" / LOG)
@@ -108,10 +108,7 @@ def _judge(status: int, said: str) -> Exception:
             "lerobot-train, or a process of its own, ran out of memory: where nothing else takes it, "
             "training.batch_size is too large for this machine."
         )
-    reason = _reason(said)
-    if any(words in reason for words in OF_THE_MACHINE):
-        return MachineError(f"lerobot-train could not go on: {reason}")
-    return RuntimeError(f"lerobot-train ended with status {status}: {reason}")
+    return RuntimeError(f"lerobot-train ended with status {status}: {_reason(said)}")
 
 
 def _reason(said: str) -> str:

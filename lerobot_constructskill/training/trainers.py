@@ -1,7 +1,6 @@
-"""What trains a policy type in a study: the class that its configuration names, or `lerobot-train`."""
+"""Trainers of policy types, and the policy that one trains. By default `lerobot-train` trains."""
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -13,19 +12,11 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.digests import file_sha256, versions
+from lerobot_constructskill.artifacts.digests import digest, known_sha256, versions
 from lerobot_constructskill.artifacts.store import Node
+from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.policy_types import decode_policy
-from lerobot_constructskill.training.recipe import Training
-
-NO_MEMORY = ("can't allocate memory", "out of memory", "OutOfDeviceMemory", "OutOfHostMemory")
-"""What torch, on a CPU and on a GPU, and Vulkan say in a `RuntimeError` when memory runs out."""
-
-OF_THE_MACHINE = (
-    *(*NO_MEMORY, "No space left on device", "Disk quota exceeded", "CUDA error", "NVIDIA driver"),
-    *("ConnectError", "ConnectionError", "ConnectTimeout", "ReadTimeout", "Connection reset"),
-)
-"""What an error says that is no fault of the policy: of a disk, the network or a GPU, which may work the next time."""
+from lerobot_constructskill.training.recipe import FACTS, Training
 
 BY_LEROBOT = "lerobot_constructskill.training.lerobot_train:LeRobotTrainer"
 """The trainer of policies whose configuration names no other."""
@@ -35,10 +26,10 @@ PUBLISHED = ("push_to_hub", "repo_id", "private", "tags", "license")
 
 
 def flush_denormals() -> None:
-    """Have this process take for zero what is too small for a float32's whole precision, in each of torch's threads.
+    """Treat denormal numbers as zero, in all of torch's threads.
 
-    Sharp keypoints underflow, and a core that computes with such numbers trains them several times slower. Call this
-    before torch first works in parallel, be it to hash weights: a thread takes the setting over when it is made.
+    Sharp keypoints underflow, and computing with denormal numbers trains them several times slower. Call this before
+    torch first works in parallel: a thread takes the setting over when it is made.
     """
     torch.set_flush_denormal(True)
 
@@ -52,18 +43,18 @@ class Trainer:
     """Distributions beside LeRobot, torch and those of the policy and the trainer whose versions may show in them."""
 
     def settle(self, config: PreTrainedConfig) -> list[PreTrainedConfig]:
-        """Write out what a configuration leaves to the machine.
+        """Resolve what a configuration leaves to the machine.
 
         Returns:
-            The configuration on this machine, and behind it those of the other kinds of machine. Of a GPU that this
-            machine lacks nothing is known: LeRobot takes the CPU in its place.
+            The configuration on this machine, then those on other kinds of machine. A GPU that this machine lacks is
+            not among them: LeRobot takes the CPU in its place.
         """
         return [config] if config.device == "cpu" else [config, replace(config, device="cpu")]
 
     def stack(self, config: PreTrainedConfig) -> int:
-        """How many seeds are one computation, whose bits may depend on all of them: 0 to 9, 10 to 19 and so on for 10.
+        """How many seeds are trained as one computation: 0 to 9, 10 to 19 and so on for 10.
 
-        `fit` then gets all seeds of such a stack, whichever of them were asked for.
+        `fit` gets all seeds of a stack, because the bits of one may depend on the others.
         """
         return 1
 
@@ -93,7 +84,7 @@ class Trainer:
             held_out: numbers of the episodes that are not trained on.
 
         Returns:
-            What rows say of the checkpoints: name to what they stand on.
+            Versions for the rows beside those of packages, such as the backbone's: name to version.
         """
         raise NotImplementedError
 
@@ -103,77 +94,61 @@ class Learner:
     """A policy that is to be trained.
 
     Args:
-        config: the configuration, in which all that the machine decides is written out, and all that does not show in
-            a checkpoint has its default.
-        places: the fields that do not show in a checkpoint: where weights lie, which of several GPUs computes.
+        config: the configuration, in which all that the machine decides is written out.
         elsewhere: the same policy as other kinds of machine would train it.
     """
 
     config: PreTrainedConfig
-    places: Mapping[str, Any]
     elsewhere: tuple["Learner", ...] = ()
 
     @classmethod
     def of(cls, fields: Mapping[str, Any]) -> "Learner":
-        """The policy of some plain fields, `type` among them. Raises InputError where they do not make one."""
+        """The policy of some plain fields, `type` among them.
+
+        Raises:
+            InputError: they do not make one.
+        """
         config = decode_policy(fields)
-        here, *elsewhere = (cls._split(one) for one in trainer_of(config).settle(config))
-        return replace(here, elsewhere=tuple(elsewhere))
-
-    @classmethod
-    def _split(cls, config: PreTrainedConfig) -> "Learner":
-        default, names = type(config)(device="cpu"), (*PUBLISHED, *trainer_of(config).places)
-        plain = {name: getattr(default, name) for name in names} | {"device": str(config.device).partition(":")[0]}
-        return cls(_with(config, plain), {name: getattr(config, name) for name in plain})
-
-    @property
-    def here(self) -> PreTrainedConfig:
-        """A configuration to train with, which is the caller's own."""
-        return _with(self.config, self.places)
+        here, *elsewhere = trainer_of(config).settle(config)
+        return cls(here, tuple(map(cls, elsewhere)))
 
     @property
     def acting(self) -> dict[str, Any]:
-        """Fields that a checkpoint of it has to be loaded with here: a path may differ by now."""
-        return {name: self.places[name] for name in ("device", *self.trainer.places)}
+        """Fields that a checkpoint of it has to be loaded with on this machine: a path may differ by now."""
+        return {name: getattr(self.config, name) for name in ("device", *self.trainer.places)}
 
     @property
     def trainer(self) -> Trainer:
         return trainer_of(self.config)
 
     def facts(self) -> dict[str, Any]:
-        """Every field that shows in a checkpoint.
+        """Every field that shows in a checkpoint; in place of the others stand their defaults.
 
-        A folder that training starts from is told by its weights, wherever it lies. A name on the Hub stands for
+        A folder that training starts from is told by its files, wherever it lies. A name on the Hub stands for
         whatever it holds, unless `pretrained_revision` says which commit.
         """
-        fields = {"type": self.config.type, **draccus.encode(self.config)}
-        start = self.config.pretrained_path
-        if start and (weights := Path(start) / "model.safetensors").is_file():
-            fields["pretrained_path"] = f"sha256 {file_sha256(weights)}"
+        fields, default = draccus.encode(self.config), draccus.encode(type(self.config)(device="cpu"))
+        fields |= {name: default[name] for name in (*PUBLISHED, *self.trainer.places)}
+        fields |= {"type": self.config.type, "device": str(self.config.device).partition(":")[0]}
+        if (start := self.config.pretrained_path) and Path(start).is_dir():
+            fields["pretrained_path"] = f"sha256 {start_sha256(Path(start))}"
         return fields
 
     def versions(self) -> dict[str, str]:
-        return versions_of(self.config)
+        """What the packages are that may show in what such a policy learns and does, beside LeRobot, torch and ours.
+
+        Code of other packages, of the policy and of its trainer, is told by its source too.
+        """
+        return versions(*self.trainer.packages) | code_of(type(self.config).__module__, type(self.trainer).__module__)
 
 
-def _with(config: PreTrainedConfig, fields: Mapping[str, Any]) -> PreTrainedConfig:
-    """A copy with other fields, without LeRobot's look at the machine: a device that it lacks may be named."""
-    copy = deepcopy(config)
-    for name, value in fields.items():
-        setattr(copy, name, value)
-    return copy
+def start_sha256(folder: Path) -> str:
+    """Hash the weights and the processors of a checkpoint that training starts from."""
+    names = sorted(path.name for path in folder.iterdir() if path.suffix in (".json", ".safetensors"))
+    return digest({name: known_sha256(folder / name) for name in names if name not in (TRAIN_CONFIG, FACTS)})
 
 
 def trainer_of(config: PreTrainedConfig) -> Trainer:
     """What trains policies of this configuration."""
     module, name = getattr(type(config), "study_trainer", BY_LEROBOT).split(":")
     return getattr(import_module(module), name)()
-
-
-def versions_of(config: PreTrainedConfig) -> dict[str, str]:
-    """What the packages are that may show in what such a policy learns and does, beside LeRobot, torch and ours.
-
-    Code of other packages, of the policy and of its trainer, is told by its source too.
-    """
-    trainer = trainer_of(config)
-    return versions(*trainer.packages) | code_of(type(config).__module__, type(trainer).__module__)

@@ -75,7 +75,7 @@ def scenario_store(root: Path) -> None:
             folder.mkdir()
             (folder / "content").write_text(self.name)
             for name, path in inputs.items():
-                (folder / name).symlink_to(Path("..") / path.name)
+                (folder / name).write_text((path / "content").read_text())
 
     store, said, first = Store(root / "store"), Thing("said"), Thing("first")
     if not store.has(said):
@@ -105,7 +105,7 @@ def scenario_study(root: Path) -> None:
         raise ValueError("no simulator here")
 
     runs._agent = no_agents
-    runs._make_inputs = lambda job, runs: {}
+    runs._lost = lambda job, nodes: {}
     Store.note = lambda *_: None  # a log says when
     policy = {"type": "act", "pretrained_backbone_weights": None}
     setting = Setting("smoke", {"obs_type": "pixels_agent_pos"})

@@ -2,9 +2,12 @@
 
 import json
 import multiprocessing
+import os
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from errno import ENOSPC
 from functools import cached_property
 from pathlib import Path
 
@@ -13,11 +16,19 @@ import pytest
 from lerobot_constructskill.artifacts import store as module
 from lerobot_constructskill.artifacts.differences import differences, outdated
 from lerobot_constructskill.artifacts.digests import digest
+from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.store import LOG, SPEC, Machine, Node, Store
 from lerobot_constructskill.errors import InputError, MachineError, MissingError
 
 CODE = {"numpy": "1"}
 """What the things are made by; a test edits it."""
+
+
+class UnsendableError(Exception):
+    """An exception that another process cannot read, as those of some HTTP clients."""
+
+    def __init__(self, status: int, *, reason: str):
+        super().__init__(f"{status} {reason}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +57,18 @@ class Thing(Node):
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         folder.mkdir()
         time.sleep(self.seconds)
-        if self.name.startswith("bad"):
-            raise KeyError(self.name)
+        match self.name.split()[0]:
+            case "bad":
+                raise KeyError(self.name)
+            case "unsendable":
+                raise UnsendableError(404, reason="not found")
+            case "full":
+                try:
+                    raise OSError(ENOSPC, "No space left on device")
+                except OSError as error:
+                    raise ValueError("An error occurred while generating the dataset") from error
+            case "dies":
+                os._exit(9)
         texts = [(root / "text").read_text() for root in inputs.values()]
         (folder / "text").write_text(f"{self.name}({', '.join(texts)})")
 
@@ -110,28 +131,69 @@ def test_a_failure_leaves_nothing_but_its_log(store):
     with pytest.raises(KeyError):
         store.get(bad)
     assert store.has(ONE) and not store.has(bad) and [*store.root.glob("things/*")] == [store.folder(ONE)]
-    store.note(OTHER, KeyError("half"))
+    store.note(OTHER, Failure.of(KeyError("half")))
     assert "KeyError: 'half'" in store.log(OTHER).read_text()
     store.get(OTHER)
     assert "KeyError" in (store.folder(OTHER) / LOG).read_text() and not store.log(OTHER).exists()
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_of_several_those_that_can_be_made_are(beside, store, monkeypatch):
+@pytest.fixture(params=[False, True], ids=["one after another", "side by side"])
+def several(request, monkeypatch):
+    """Things of some names, all made of one; they are made in one of two ways."""
     monkeypatch.setattr(module, "cores", lambda: 2)
-    good, bad = (replace(Thing(name, (ONE,)), is_single_threaded=beside) for name in ("good", "bad"))
-    lost = replace(Thing("lost", (Thing("bad input"),)), is_single_threaded=beside)
-    failed = store.get_all([good, bad, lost, good], Machine())
-    assert {one: str(error) for one, error in failed.items()} == {bad: "'bad'", lost: "'bad input'"}
+    return lambda *names: [replace(Thing(name, (ONE,)), is_single_threaded=request.param) for name in names]
+
+
+def test_of_several_those_that_can_be_made_are(several, store):
+    good, bad, unsendable, full = several("good", "bad", "unsendable", "full")
+    lost = replace(Thing("lost", (Thing("bad input"),)), is_single_threaded=good.is_single_threaded)
+    failed = store.get_all([good, bad, unsendable, full, lost, good], Machine())
+    assert {one: failure.said for one, failure in failed.items()} == {
+        bad: "KeyError: 'bad'",
+        unsendable: "UnsendableError: 404 not found",
+        full: "ValueError: An error occurred while generating the dataset",
+        lost: "KeyError: 'bad input'",
+    }
+    assert [one for one, failure in failed.items() if failure.is_of_the_machine] == [full]
+    assert all(failure.said in failure.traceback and "in make" in failure.traceback for failure in failed.values())
     assert text(store, good) == "good(one())"
+
+
+def test_what_several_lack_is_tried_once(several, store, monkeypatch):
+    tried, get = [], Store._make
+    monkeypatch.setattr(Store, "_make", lambda self, node, machine: tried.append(node) or get(self, node, machine))
+    lacking = Thing("bad input")
+    failed = store.get_all([replace(one, made_of=(lacking,)) for one in several("a", "b", "c")], Machine())
+    assert len(failed) == 3 and tried == [lacking]
+
+
+def test_a_process_that_dies_is_the_machines_failure_of_what_it_made_and_of_nothing_else(store, monkeypatch):
+    monkeypatch.setattr(module, "cores", lambda: 2)
+    dies, slow = (Thing(name, seconds=at, is_single_threaded=True) for name, at in (("dies", 0.5), ("slow", 1)))
+    failed = store.get_all([dies, slow], Machine())
+    assert {one: failure.is_of_the_machine for one, failure in failed.items()} == {dies: True}
+    assert text(store, slow) == "slow()", "it was made by a second process"
 
 
 def test_what_is_passing_goes_with_what_it_was_for(store):
     passing = Thing("passing", (ONE,), is_passing=True)
-    store.get(Thing("whole", (passing,)))
+    assert store.get(Thing("whole", (passing,))) and text(store, Thing("whole", (passing,))) == "whole(passing(one()))"
     with pytest.raises(KeyError):
         store.get(Thing("bad", (passing,)))
     assert store.has(ONE) and not store.has(passing)
+    assert {path.name for path in store.root.glob("things/*")} == {ONE.digest, Thing("whole", (passing,)).digest}
+
+
+def test_what_is_passing_stays_while_anything_is_made_of_it(store):
+    passing = Thing("passing", (ONE,), is_passing=True)
+    whole, slow = Thing("whole", (passing,)), Thing("slow", (passing,), seconds=0.5)
+    store.get(whole)
+    other = threading.Thread(target=store.get, args=(slow,))
+    other.start()
+    time.sleep(0.2)
+    store.get(whole)  # which is there
+    other.join()
+    assert text(store, slow) == "slow(passing(one()))"
 
 
 def test_a_hundred_times_made_of_each_other_is_no_deeper_than_once(store):

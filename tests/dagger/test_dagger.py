@@ -46,7 +46,6 @@ def settings(tmp_path_factory, tiny_weights):
         "episodes": EPISODES,
         "betas": [0.5, 0.0],
         "max_steps": 15,
-        "eval_episodes": 1,
     }
     file = tmp_path_factory.mktemp("dagger") / "tiny.yaml"
     file.write_text(yaml.safe_dump(fields))
@@ -128,9 +127,9 @@ def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, set
     def stop(*_):
         raise MemoryError
 
-    def note(self, seeds, *others):
+    def note(self, checkpoint, seeds, machine):
         asked.append(list(seeds))
-        return drive(self, seeds, *others)
+        return drive(self, checkpoint, seeds, machine)
 
     monkeypatch.setattr(Round, "_drive", note)
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
@@ -145,9 +144,9 @@ def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, set
 @pytest.mark.parametrize("readout", ["heat_maps", "spatial_softmax"])
 def test_joined_features_are_those_of_the_whole_set_encoded(readout, made, settings, tmp_path):
     plan, store = Plan.of(parse(DaggerConfig, ["--repo_id=local/driven"], settings)), Store(settings.parent / "store")
-    config = replace(plan.learner.here, readout=readout)
+    config = replace(plan.learner.config, readout=readout)
     joined = FeatureTrainer().learns_from(config, plan.data(ROUNDS))
-    assert len(joined.of_parts) == 1 + ROUNDS and not store.has(joined), "it has gone with what was trained on it"
+    assert len(joined.of_parts) == 1 + ROUNDS and not store.has(joined), "it is written beside what is trained on it"
     whole = Features(config, plan.data(ROUNDS))
     object.__setattr__(whole, "digest", joined.digest)  # the name of the data set, which its files hold
     inputs = {"demonstrations": store.get(plan.data(ROUNDS))}

@@ -14,10 +14,11 @@ import torch
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.analysis.section import Analysis
-from lerobot_constructskill.artifacts import revisions
+from lerobot_constructskill.artifacts import pools, revisions
+from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.revisions import BEFORE
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.store import LOG, Store
 from lerobot_constructskill.errors import InputError, MachineError, UserError, kind_of
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
@@ -36,12 +37,12 @@ from lerobot_constructskill.study.rows import (
     read_rows,
     write_rows,
 )
-from lerobot_constructskill.study.runs import EPISODES, Job, _without_machines
+from lerobot_constructskill.study.runs import EPISODES, Job, make_runs
 from lerobot_constructskill.study.session import choose, run_study
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.status import status
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import EVALUATION, TIMINGS, TRAINING, seconds_by_stage, timed
+from lerobot_constructskill.study.timing import TIMINGS, seconds_per_run, timed
 from lerobot_constructskill.study.validate import heldout, list_pairs
 from lerobot_constructskill.training.heldout import FILE
 from lerobot_constructskill.training.recipe import Training
@@ -232,6 +233,8 @@ def test_what_training_starts_from_is_told_by_its_weights(tmp_path):
 
     first = begun("base", b"one")
     assert begun("moved", b"one") == first != begun("base", b"another")
+    (tmp_path / "moved" / "policy_preprocessor.json").write_text("{}")
+    assert begun("moved", b"one") != first, "what it reads is prepared otherwise"
 
 
 def test_an_edited_generator_file_runs_exactly_what_depends_on_it(tmp_path):
@@ -338,20 +341,13 @@ def test_going_on_with_a_published_study_adds_to_its_provenance(tmp_path, monkey
     root, stage = tmp_path / "x", "of which evaluation, s"
     root.mkdir()
     (root / PROVENANCE).write_text(json.dumps({"wall time, s": 2000, stage: 700, "beside it": "tests"}))
-
-    def make_one(job):
-        with timed(root, "evaluation"):
-            pass
-        (root / TIMINGS).write_text('{"stage": "evaluation", "seconds": 5}\n')
-        yield from job.runs
-
-    monkeypatch.setattr("lerobot_constructskill.study.session.make_runs", make_one)
+    monkeypatch.setattr("lerobot_constructskill.study.session.make_runs", lambda job: job.runs)
     monkeypatch.setattr("lerobot_constructskill.study.session.validate", lambda *_: None)
     run_study(study(variants={"a": Variant(ACT, seeds=1)}, references={}), "", root, Store(tmp_path / "s"), Options())
     facts = json.loads((root / PROVENANCE).read_text())
-    assert facts["wall time, s"] >= 2000 and facts[stage] == 705 and facts["beside it"] == "tests"
+    assert facts["wall time, s"] >= 2000 and facts[stage] == 700 and facts["beside it"] == "tests"
     (root / PROVENANCE).write_text('{"wall time, s": "1 h"}')
-    with pytest.raises(InputError, match="'wall time, s' must be a number of seconds, not '1 h'"):
+    with pytest.raises(InputError, match="wall time, s: Input should be a valid number"):
         run_study(study(), "", root, Store(tmp_path / "s"), Options())
 
 
@@ -374,13 +370,13 @@ def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
 
 
 def test_a_torn_line_of_times_is_left_out(tmp_path):
-    with timed(tmp_path, "encoding"):
+    with timed(tmp_path, "fixed/a", 1):
         pass
     with (tmp_path / TIMINGS).open("a") as file:
-        file.write('{"stage": "encod{"stage": "evaluation", "seconds": 0.0}\n')
-    with timed(tmp_path, "evaluation"):
+        file.write('{"arm": "fix{"arm": "fixed/b", "seconds": 0.0}\n')
+    with timed(tmp_path, "fixed/c", 1):
         pass
-    assert seconds_by_stage(tmp_path) == {"encoding": 0.0, "evaluation": 0.0}
+    assert seconds_per_run(tmp_path) == {"fixed/a": 0.0, "fixed/c": 0.0}
 
 
 def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
@@ -434,7 +430,7 @@ def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_pa
     table = make_all(study(), tmp_path)
     published = read_rows(tmp_path / "x" / "rows.parquet")
     run, mine = table.runs[0], Store(tmp_path / "mine")
-    failed = replace(table.episodes(run)[0], error_kind="fault", error="RuntimeError: ours")
+    failed = replace(table.made(run)[0], error_kind="fault", error="RuntimeError: ours")
     with mine.writing(run) as folder:
         folder.mkdir()
         write_rows([failed], folder / EPISODES, EpisodeRow)
@@ -464,6 +460,20 @@ def test_what_a_machine_lacks_for_one_job_leaves_the_others_alone(tmp_path, monk
     with pytest.raises(MachineError, match="out of memory"):
         made.extend(session._execute(session._jobs(list_runs(study()), tmp_path, None, Options()), Options()))
     assert {run.arm.name for run in made} == {"no_op", "replay", "b"}
+
+
+def test_what_a_job_elsewhere_made_before_it_stopped_is_kept(tmp_path, monkeypatch):
+    def make(job):
+        yield job.runs[0]
+        raise MachineError("out of memory")
+
+    monkeypatch.setattr(session, "make_runs", make)
+    monkeypatch.setattr(session, "open_pool", lambda *_: pools.open_pool("processes", 1))  # in the place of Ray
+    made, options = [], Options(executor="ray")
+    with pytest.raises(MachineError, match="out of memory"):
+        for run in session._execute(session._jobs(list_runs(study()), tmp_path, None, options), options):
+            made.append(run.arm.name)
+    assert sorted(made) == ["a", "b", "no_op", "replay"]
 
 
 def test_what_is_missing_is_a_row_and_a_line_of_the_status(tmp_path):
@@ -520,18 +530,17 @@ def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, 
         folder.mkdir()
         edit("source b")
     with refused:
-        runs_module._write_failed(Job((run,), store, tmp_path), run, ValueError("of a half-written line"))
+        runs_module._write_failed(Job((run,), store, tmp_path), run, Failure.of(ValueError("half a line")))
     assert not store.has(run.checkpoints) and not store.has(run) and run.digest == digest
 
 
 def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
     runs = list_runs(study())
     table = Table(tmp_path, runs, Store(tmp_path / "store"))
-    with timed(tmp_path, EVALUATION, "fixed/a", 2):
+    with timed(tmp_path, "fixed/a", 2):
         pass  # what took long ago is not what it takes
-    for stage in (TRAINING, EVALUATION):
-        with (tmp_path / TIMINGS).open("a") as file:
-            file.write(json.dumps({"stage": stage, "seconds": 200, "arm": "fixed/a", "runs": 2}) + "\n")
+    with (tmp_path / TIMINGS).open("a") as file:
+        file.write(json.dumps({"arm": "fixed/a", "seconds": 200}) + "\n")
     lines = status(table, runs).splitlines()
     told = dict(zip(lines, lines[1:], strict=False))
     assert told["fixed/a: 0 finished, 0 failed, 3 missing"] == "    to make: seeds 0, 1, 2, about 10 min"
@@ -542,9 +551,6 @@ def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_ta
         "    to make: seed 1, about 3 min",
         "To make: 1 run, about 3 min; first the demonstrations: smoke",
     ]
-    with table.store.writing(runs[2].checkpoints) as folder:
-        folder.mkdir()
-    assert "seed 0, about 2 min" in status(table, choose(runs, "fixed/a/seed_0"))
 
 
 def test_the_status_of_a_misspelt_part_is_refused(tmp_path):
@@ -557,6 +563,7 @@ def test_the_status_of_a_misspelt_part_is_refused(tmp_path):
 def test_runs_that_are_something_else_are_one_sentence(tmp_path):
     table = make_all(study(), tmp_path)
     folder = table.store.folder(table.runs[-1])
+    (tmp_path / "x" / ROWS).unlink()
     (folder / EPISODES).unlink()
     with pytest.raises(InputError, match="has no episodes"):
         make_all(study(), tmp_path)
@@ -731,17 +738,54 @@ def _wrapped(cause: Exception) -> Exception:
     ],
     ids=str,
 )
-def test_what_the_machine_lacks_is_no_result_of_a_run_until_it_comes_back_each_time(error, is_the_machines, tmp_path):
-    run = list_runs(study())[0]
+def test_what_the_machine_lacks_is_no_result_of_a_run_until_it_comes_back_each_time(
+    error, is_the_machines, tmp_path, monkeypatch
+):
+    job = Job(tuple(list_runs(study())[2:4]), Store(tmp_path), tmp_path)  # of a policy
+    lacking, other = job.runs
+    monkeypatch.setattr(Store, "get_all", lambda *_: {lacking.checkpoints: Failure.of(error)})
+    monkeypatch.setattr(runs_module, "_agent", lambda *_: {}["agent"])
+    made = []
+    for _ in range(runs_module.TRIES - 1 if is_the_machines else 0):
+        with pytest.raises(MachineError) as raised:
+            for run in make_runs(job):
+                made.append(run)
+        assert {*made} == {other}, "the others are made"
+        assert " ".join(str(error).split()) in str(raised.value)
+        made = []
+    assert {*make_runs(job)} == {lacking, other}
+    (row,) = load_rows(job.store.folder(lacking) / EPISODES, EpisodeRow)
+    assert row.error_kind == ("machine" if is_the_machines else kind_of(error)) and str(error) in row.error
+    log = (job.store.folder(lacking) / LOG).read_text()
+    assert log.count(str(error)) >= (runs_module.TRIES if is_the_machines else 1)
+
+
+def test_a_card_that_fails_is_a_row_that_does_not_name_it(tmp_path, monkeypatch):
+    def fails(_):
+        raise RuntimeError("Found no NVIDIA driver on your system.")
+
+    monkeypatch.setattr(torch.cuda, "get_device_name", fails)
+    (run,) = list_runs(study(references={}, variants={"a": Variant(ACT, seeds=1)}))
+    run.arm.learner.config.device = "cuda"
+    monkeypatch.setattr(Store, "get_all", lambda *_: {run.checkpoints: Failure.of(RuntimeError("CUDA error"))})
     job = Job((run,), Store(tmp_path), tmp_path)
-    if not is_the_machines:
-        assert _without_machines(job, {run: error}) == {run: error}
-        return
     for _ in range(runs_module.TRIES - 1):
-        with pytest.raises(type(error)):
-            _without_machines(job, {run: error})
-    assert kind_of(_without_machines(job, {run: error})[run]) == "machine"
-    assert job.store.log(run).read_text().count(str(error)) >= runs_module.TRIES - 1
+        with pytest.raises(MachineError, match="CUDA error"):
+            [*make_runs(job)]
+    assert [*make_runs(job)] == [run]
+
+
+def test_the_machines_failure_of_one_seed_leaves_the_rollouts_of_the_others(tmp_path, monkeypatch):
+    job = Job(tuple(list_runs(study())[2:4]), Store(tmp_path), tmp_path)
+    rollouts = [SimpleNamespace(error=MachineError("lost")), SimpleNamespace(error=None)]
+    monkeypatch.setattr(Store, "get_all", lambda *_: {})
+    monkeypatch.setattr(runs_module, "_agent", lambda *_: "agent")
+    monkeypatch.setattr(runs_module, "roll_out", lambda *_, **__: enumerate(rollouts))
+    written = []
+    monkeypatch.setattr(runs_module, "_write_finished", lambda job, run, *_: written.append(run))
+    with pytest.raises(MachineError, match="^lost$"):
+        [*make_runs(job)]
+    assert written == [job.runs[1]]
 
 
 @pytest.mark.parametrize(
@@ -750,12 +794,13 @@ def test_what_the_machine_lacks_is_no_result_of_a_run_until_it_comes_back_each_t
         ("cpu", "physx_cpu, sapien_cpu rendering", None),
         (None, None, None),
         ("cuda:1", "physx_cpu, sapien_cpu rendering", "card cuda:1"),
+        ("cuda:1", None, None),
         ("cpu", "physx_cpu, sapien_cuda rendering", "card None"),
     ],
 )
 def test_a_row_names_the_graphics_card_where_it_used_one(device, backend, card, monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda which: f"card {which}")
-    learner = device and SimpleNamespace(places={"device": device})
+    learner = device and SimpleNamespace(config=SimpleNamespace(device=device))
     run = SimpleNamespace(arm=SimpleNamespace(learner=learner))
     assert runs_module._made_on(run, backend) == {"processor": processor()} | ({"card": card} if card else {})
 
@@ -770,8 +815,9 @@ EDITS = {
     "features/encode.py": ("policy", "import numpy as np\n", "import numpy as np\n\nBATCHES = 2\n"),
     "rollout/lockstep.py": ("episodes", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
     "study/runs.py": ("runs", "FILMED_SEED = 0", "FILMED_SEED = 1"),
-    "dagger/driving.py": ("nothing", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
-    "study/table.py": ("nothing", "HELDOUT = ", "HELD = "),
+    "dagger/driving.py": ("nothing", "from dataclasses import", "TIMES = 0.9
+from dataclasses import"),
+    "study/table.py": ("nothing", "class Table", "class Rows"),
     "analysis/report/formats.py": ("nothing", '"""', '"""Said otherwise. '),
 }
 VIT = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
