@@ -48,9 +48,6 @@ def _sides(matched: MatchedSides) -> str:
         "A": (matched.a, judgement.counts_a, judgement.mean_a, matched.rates_a),
         "B": (matched.b, judgement.counts_b, judgement.mean_b, matched.rates_b),
     }
-    for letter, (side, *_) in sides.items():
-        if side.env is None:
-            lines.append(f"lerobot-eval does not write where it evaluated: {letter} is taken to be from there")
     lines += ["", f"   {'seeds that placed':<19}{'episodes placed, mean of seeds':<32}each seed, of {len(starts)}"]
     for letter, (side, counts, mean, rates) in sides.items():
         each = [f"{rate * len(starts):.0f}" for rate in rates]
