@@ -87,6 +87,7 @@ def _find(patterns: list[str]) -> list[Path]:
 def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) -> dict:
     import torch
 
+    from lerobot_constructskill.progress import Progress
     from lerobot_constructskill.rollout.agents import PolicyAgent
     from lerobot_constructskill.rollout.offline import (
         check_actions,
@@ -94,15 +95,16 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
         observing_frames,
         offline_metrics,
         predict,
+        spans,
     )
 
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
     view = observed(dataset, agent.policy)
-    pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
+    bar = Progress(spans(dataset, episodes), agent.policy.name, unit="demo", leave=False)
     with observing_frames(dataset):
-        predictions = predict(*pipeline, view, episodes, config.batch_size)
+        predictions = [predict(agent, view, span, config.batch_size) for span in bar]
     return {
         "policy": agent.policy.name,
         "training_seed": _training_seed(checkpoint),

@@ -19,16 +19,15 @@ from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
-from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
+from .configuration_frozen_vit import FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
 from .feature_sets import check_features, describe, open_patches, stated
-from .heads import ChunkHeads, heads_loss, offsets
+from .heads import ChunkHeads, heads_loss
 from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
 from .readouts import READOUTS
 from .shared_encoder import POOLED, SharedEncoders
 from .weights import load_weights, read_tensors, state_sha256
 
-HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
@@ -94,7 +93,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
         self.register_state_dict_post_hook(_drop_backbone)
         self.register_load_state_dict_post_hook(_excuse_backbone)
-        self._heldout = (0.0, 0)
         self._has_seen = False
         self.reset()
 
@@ -112,8 +110,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Return the loss on a batch of chunks, and its terms as floats.
 
-        In evaluation mode the translation error is also added up: LeRobot keeps nothing but the loss on held-out data.
-
         Args:
             batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
                 that finds points also where they are, (B, 2P).
@@ -126,21 +122,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if self.readout.points and points is None:
             raise self._lacks_points()
         chunk, read = self.heads(*self.head_inputs(batch))
-        if not self.training:
-            error, count = self._translation_error(chunk, batch)
-            self._heldout = (self._heldout[0] + error, self._heldout[1] + count)
         loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], _padded(batch), points, reduction)
         return loss, {name: term.mean().item() for name, term in terms.items()}
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
-        """Switch the heads' mode; back in training mode, log the error of the held-out pass that came before."""
+        """Switch the heads' mode, and record what computes the features that they learn from."""
         if mode and self.config.feature_column is None:  # the heads learn from this encoder's own features
             own = {"precision": self.backbone.precision, "runtime": self.backbone.runtime}
             self.encoder_record = replace(self.encoder_record, **own)
-        error, count = self._heldout
-        if mode and count:
-            self._heldout = (0.0, 0)
-            logger.info("%s=%.4e", HELDOUT_METRIC, error / count)  # LeRobot's meters print three decimals
         return super().train(mode)
 
     @torch.no_grad()
@@ -322,17 +311,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if OBS_STATE not in batch:
             raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
         return pooled, batch[OBS_STATE]
-
-    @torch.no_grad()
-    def translation_error(self, batch: dict[str, Tensor]) -> tuple[float, int]:
-        """Return the sum of a batch's squared translation errors over valid steps, in m2, and of how many numbers."""
-        return self._translation_error(self._raw_chunk(batch), batch)
-
-    def _translation_error(self, chunk: Tensor, batch: dict[str, Tensor]) -> tuple[float, int]:
-        padded = _padded(batch)
-        metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        squares = offsets(chunk, batch[ACTION], padded)[..., metres].square()
-        return squares.sum().item(), int((~padded).sum()) * len(metres)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         return self.heads(*self.head_inputs(batch))[0]
