@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
-from lerobot_constructskill.bounds import UNSEEN, Among, NotEmpty, Pattern, Seed, check
+from lerobot_constructskill.bounds import UNSEEN, Among, Checked, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import OBS_TYPES, TASKS, get_task
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Yaml
@@ -25,7 +25,7 @@ OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
 
 
 @dataclass(frozen=True)
-class About:
+class About(Checked):
     """What a submission must say of its policy.
 
     Args:
@@ -54,9 +54,6 @@ class About:
     observes: Annotated[str, Among(OBSERVES)]
     url: Link | None = None
     notes: Line | None = None
-
-    def __post_init__(self):
-        check(self)
 
     @property
     def is_policy(self) -> bool:

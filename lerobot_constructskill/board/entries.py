@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -86,27 +86,28 @@ class Entry:
         return Standing(claims, placed, lifted, errors=sum(one.error is not None for one in there))
 
 
-class Read(NamedTuple):
-    """What was read of a board: its entries by name, and of each that cannot be read a sentence that names it."""
+def read_entries(root: Path) -> tuple[list[Entry], list[str]]:
+    """Read every entry of a board's folder.
 
-    entries: list[Entry]
-    refused: list[str]
+    Returns:
+        The entries in the order of their names, and a sentence for each entry that cannot be read.
 
-
-def read_entries(root: Path) -> Read:
-    """Every entry of a board's folder. Raises MissingError where there is no such folder."""
+    Raises:
+        MissingError: there is no such folder.
+        InputError: the board's verdicts are no folder.
+    """
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
     if (root / VERIFIED).exists() and not (root / VERIFIED).is_dir():
         raise InputError(f"'{root / VERIFIED}' is not a folder of verdicts.")
-    read = Read([], [])
+    entries, refused = [], []
     for path in sorted((root / ENTRIES).iterdir()):
         if path.suffix != ".partial":  # an entry is being written, or was when its process was killed
             try:
-                read.entries.append(_entry(root, path))
+                entries.append(_entry(root, path))
             except (InputError, MissingError) as error:
-                read.refused.append(f"Entry {path.name!a}: {error}")
-    return read
+                refused.append(f"Entry {path.name!a}: {error}")
+    return entries, refused
 
 
 def _entry(root: Path, path: Path) -> Entry:

@@ -110,8 +110,7 @@ class _Lanes:
                 self.on_step(i, len(episodes) - 1, actions[i], step)
         finished = [i for i, step in self.current.items() if step.done]
         for i in finished:
-            del self.current[i]
-            self.rollouts[i].backend = self.sims.backend(i)
+            self.rollouts[i].backend = self.current.pop(i).backend
         self._start([i for i in finished if len(self.rollouts[i].episodes) < len(self.seeds)])
         return len(finished)
 

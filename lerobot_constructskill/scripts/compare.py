@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from lerobot_constructskill.analysis.section import Level
-from lerobot_constructskill.bounds import Among, Count, Device, Seed, Steps, Text, check
+from lerobot_constructskill.bounds import Among, Checked, Count, Device, Seed, Steps, Text
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.scripts.console import run, say
 
@@ -20,7 +20,7 @@ FAILED = 3
 
 
 @dataclass
-class CompareConfig:
+class CompareConfig(Checked):
     """Compare two policies by their training seeds: constructskill-compare A B [flags].
 
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
@@ -59,9 +59,6 @@ class CompareConfig:
     out: Path | None = None
     together: Count = 10
     device: Device | None = None
-
-    def __post_init__(self):
-        check(self)
 
     @property
     def env(self) -> dict[str, Any]:
@@ -106,7 +103,3 @@ def compare(config: CompareConfig) -> str:
 
 def main() -> None:
     run(CompareConfig, compare, first=("a", "b"))
-
-
-if __name__ == "__main__":
-    main()

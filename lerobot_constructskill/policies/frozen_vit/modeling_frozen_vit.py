@@ -79,11 +79,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.encoder_record = self._begin_record(encoder_record)
         spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
-        self._check_column()
+        self._check_features(dataset_meta.root if dataset_meta is not None else None)
         if encoder_record is None:
             check_native(config.backbone_precision, config.device)
             self._load_backbone()
-        self._find_patches(dataset_meta.root if dataset_meta is not None else None)
         self.heads = self.fresh_heads()
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
@@ -114,13 +113,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
                 that finds points also where they are, (B, 2P).
             reduction: "mean" over all valid steps (of points over samples), or "none" for one loss per sample (B,).
-
-        Raises:
-            ValueError: the batch lacks the points.
         """
-        points = batch.get(self.config.point_key) if self.readout.points else None
-        if self.readout.points and points is None:
-            raise self._lacks_points()
+        points = batch[self.config.point_key] if self.readout.points else None
         chunk, read = self.heads(*self.head_inputs(batch))
         loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], _padded(batch), points, reduction)
         return loss, {name: term.mean().item() for name, term in terms.items()}
@@ -204,12 +198,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         runtime = stated(column, "runtime", RUNTIMES) or known.runtime
         return replace(known, precision=trained or config.backbone_precision, runtime=runtime)
 
-    def _check_column(self) -> None:
-        """Refuse features that were made by another encoder."""
+    def _check_features(self, root: Path | None) -> None:
+        """Refuse features of another encoder, or without the patch features that are read; they lie in `root`."""
+        self.patches_root = root
         record, encoder, column = self.encoder_record, self.backbone, self.config.feature_column
         if column is not None:
             made_by = describe(encoder.spec, record.sha256, record.precision, encoder.crop, encoder.blind)
             check_features(column, made_by, encoder.spec.feature_dim)
+            if self.readout.reads_patches:
+                open_patches(root)
 
     def _check_data_set(self, meta: Any) -> None:
         """Refuse a data set of another rate, or without the points that the readout learns to find."""
@@ -220,19 +217,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             )
         found = meta.features.get(self.config.point_key, {}).get("names")
         if self.readout.points and found != [*self.readout.points]:
-            raise self._lacks_points()
-
-    def _lacks_points(self) -> InputError:
-        return InputError(
-            f"readout={self.config.readout} learns from {self.config.point_key} ({', '.join(self.readout.points)}): "
-            "train on a feature set that constructskill-encode makes with --patches=true --points=true."
-        )
-
-    def _find_patches(self, root: Path | None) -> None:
-        """Keep the folder of a data set's patch features, and refuse one without them if they are to be read."""
-        self.patches_root = root
-        if self.config.feature_column is not None and self.readout.reads_patches:
-            open_patches(root)
+            raise InputError(
+                f"readout={self.config.readout} learns from {self.config.point_key} "
+                f"({', '.join(self.readout.points)}): train on a feature set that constructskill-encode makes with "
+                "--patches=true --points=true."
+            )
 
     def _log_crossing(self) -> None:
         """Log that features are computed otherwise than those that the heads learned from."""
@@ -286,8 +275,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             FileNotFoundError: it lacks the patch features that the readout takes.
         """
         self.config.set_dataset_feature_metadata(meta.features)
-        self._check_column()
-        self._find_patches(meta.root)
+        self._check_features(meta.root)
 
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
