@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.analysis.stats.intervals import Estimate
-from lerobot_constructskill.analysis.stats.spread import mean_rate
+from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission

@@ -6,7 +6,8 @@ from math import comb, inf
 import numpy as np
 import pytest
 
-from lerobot_constructskill.analysis.stats.comparisons import Conclusion
+from lerobot_constructskill.analysis.stats.comparisons import Conclusion, mean_p_value
+from lerobot_constructskill.analysis.stats.intervals import mean_rate
 from lerobot_constructskill.analysis.stats.judgement import judge, mean_difference, smallest_p_value
 from lerobot_constructskill.analysis.stats.power import (
     MOST,
@@ -14,7 +15,6 @@ from lerobot_constructskill.analysis.stats.power import (
     detectable_mean_difference,
     seeds_needed_for_mean,
 )
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate
 
 
 def shares(*counts: int) -> np.ndarray:

@@ -11,13 +11,15 @@ from scipy.stats import binom, bootstrap, kendalltau
 from lerobot_constructskill.analysis.stats.comparisons import (
     Conclusion,
     boschloo,
-    compare_counts,
+    compare,
     fisher,
     holm,
+    mean_p_value,
     probability_better,
+    spread_p_value,
 )
 from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
-from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, newcombe
+from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, mean_rate, newcombe
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
 from lerobot_constructskill.analysis.stats.power import (
     _rejected,
@@ -26,7 +28,6 @@ from lerobot_constructskill.analysis.stats.power import (
     seeds_needed,
     wrong_order,
 )
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate, spread_p_value
 from lerobot_constructskill.study.rows import NOT_RUN
 
 # Paper, Tables I and II: seeds that lifted, seeds that placed, seeds.
@@ -38,6 +39,11 @@ PAIRS = list(combinations(BACKBONES, 2))
 
 # Where shares and numbers of seeds are at their ends, and between.
 ARMS = [Counts(met, seeds) for seeds in (1, 3, 10) for met in {0, 1, seeds // 2, seeds}]
+
+
+def shares(counts: Counts) -> np.ndarray:
+    """Seeds of which so many succeed always, and the others never."""
+    return np.repeat([1.0, 0.0], [counts.met, counts.seeds - counts.met])
 
 
 @pytest.fixture
@@ -57,7 +63,9 @@ def test_fisher_gives_the_papers_four_p_values(counts, other, p_value, digits):
 def test_what_the_paper_does_not_say():
     """Spec, section 5, last paragraph."""
     assert round(fisher(BASELINE, NOISE_FREE), 2) == 0.10
-    comparison = compare_counts(LIFTED, PAIRS)[PAIRS.index(("dinov2", "clip"))]
+    comparison = compare({name: shares(counts) for name, counts in LIFTED.items()}, PAIRS)[
+        PAIRS.index(("dinov2", "clip"))
+    ]
     assert round(comparison.boschloo, 3) == 0.042
     assert round(comparison.holm, 2) == 0.17
     assert comparison.conclusion is Conclusion.INCONCLUSIVE
@@ -125,7 +133,7 @@ def test_holm_only_raises_and_counts_what_was_not_made():
 def test_conclusions():
     counts = {"all": Counts(30, 30), "every": Counts(30, 30), "half": Counts(15, 30), "three": Counts(3, 3)}
     pairs = [("all", "half"), ("half", "all"), ("all", "every"), ("half", "three"), ("all", "absent")]
-    comparisons = compare_counts(counts, pairs)
+    comparisons = compare({name: shares(own) for name, own in counts.items()}, pairs)
     conclusions = [Conclusion.BETTER, Conclusion.WORSE, Conclusion.ALIKE, Conclusion.INCONCLUSIVE]
     assert [comparison.conclusion for comparison in comparisons] == conclusions
     assert comparisons[0].holm == pytest.approx(5 * comparisons[0].boschloo)
@@ -298,8 +306,8 @@ def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_ru
     kinds = {"lifted": "boolean", "placed": "boolean", "error_kind": "string", "error": "string"}
     table = pd.DataFrame(rows).astype(kinds)
     runs = runs_of(table)
-    assert count(runs, "lifted") == count(runs, "placed") == Counts(1, 2)
+    assert count(runs["lifted_rate"]) == count(runs["placed_rate"]) == Counts(1, 2)
     assert runs["placed_rate"].tolist() == [0.5, 0.0] and runs["episodes"].tolist() == [2, 0]
     assert runs["error_kind"].isna().tolist() == [True, False]
-    assert count(runs_of(table[table["training_seed"] == 1]), "lifted") == Counts(0, 1)
+    assert count(runs_of(table[table["training_seed"] == 1])["lifted_rate"]) == Counts(0, 1)
     assert runs_of(table[table["training_seed"] == 2]).empty

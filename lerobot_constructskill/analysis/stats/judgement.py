@@ -5,15 +5,20 @@ from math import comb, sqrt
 
 import numpy as np
 
-from lerobot_constructskill.analysis.stats.comparisons import Conclusion, boschloo, conclude
-from lerobot_constructskill.analysis.stats.intervals import Estimate
-from lerobot_constructskill.analysis.stats.outcomes import Counts
+from lerobot_constructskill.analysis.stats.comparisons import (
+    PERMUTATIONS,
+    Conclusion,
+    boschloo,
+    conclude,
+    mean_p_value,
+)
+from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count
 from lerobot_constructskill.analysis.stats.power import (
     detectable_difference,
     detectable_mean_difference,
     seeds_needed_for_mean,
 )
-from lerobot_constructskill.analysis.stats.spread import PERMUTATIONS, mean_p_value, mean_rate
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         a, b: share in [0, 1] of successful episodes of each seed, (seeds,) each, one or more.
         alpha: level of the test; intervals are at 1 - alpha.
     """
-    counts_a, counts_b = (Counts(int(np.sum(rates > 0)), len(rates)) for rates in (a, b))
+    counts_a, counts_b = count(a), count(b)
     mean_a, mean_b = (mean_rate(rates, 1 - alpha) for rates in (a, b))
     apart, p_value, deviation = mean_difference(mean_a, mean_b), mean_p_value(a, b), _deviation(a, b)
     rate = max(mean_b.value, 1 - mean_b.value)  # a rise from 1 - rate is as hard to see as a drop from rate
