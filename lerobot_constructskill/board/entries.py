@@ -52,28 +52,28 @@ class Entry:
     verdict: dict[str, Any]
 
     @property
-    def said(self) -> Declaration:
+    def declaration(self) -> Declaration:
         return self.submission.declaration
 
     @property
     def is_reference(self) -> bool:
         """Whether it is a floor or a ceiling, which has no rank and lacks no seeds."""
-        return not self.said.about.is_policy
+        return not self.declaration.about.is_policy
 
     @property
     def is_ranked(self) -> bool:
-        is_checked = self.level != CLAIMED and self.said.is_replayable
-        return is_checked and not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
+        is_checked = self.level != CLAIMED and self.declaration.is_replayable
+        return is_checked and not self.is_reference and len(self.declaration.training_seeds) >= RANKED_FROM
 
     @property
     def missing_seeds(self) -> int:
         """How many of the protocol's training seeds it lacks."""
-        return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.said.training_seeds})
+        return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.declaration.training_seeds})
 
     @cached_property
     def standings(self) -> dict[str, Standing]:
         """What it reached in each of its settings, by name."""
-        return {name: self._standing(name) for name in self.said.settings}
+        return {name: self._standing(name) for name in self.declaration.settings}
 
     def _standing(self, setting: str) -> Standing:
         there = sorted((one for one in self.submission.claims if one.setting == setting), key=lambda one: one.key)
@@ -127,7 +127,7 @@ def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     alike: dict[tuple, dict[str, Estimate]] = {}
     for entry in entries:
         if entry.is_ranked and setting in entry.standings:
-            kind = entry.said.settings_class, entry.said.settings[setting].compared
+            kind = entry.declaration.settings_class, entry.declaration.settings[setting].compared
             alike.setdefault(kind, {})[entry.name] = entry.standings[setting].placed
     found = {}
     for placed in alike.values():

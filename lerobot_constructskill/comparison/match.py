@@ -10,13 +10,11 @@ import numpy as np
 from lerobot_constructskill.analysis.stats.judgement import Judgement, judge
 from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
-    IN_STUDY,
     Side,
     Source,
     check_equal,
     conditions,
-    read_recorded,
-    read_study,
+    read,
 )
 from lerobot_constructskill.errors import InputError
 
@@ -73,7 +71,7 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
         InputError: a side cannot be read, or nothing of it can be compared with the other.
     """
     _check_sources(a, b, asked)
-    sides = {one: _read(one) for one in (a, b) if one.kind != CHECKPOINT}
+    sides = {one: read(one) for one in (a, b) if one.kind != CHECKPOINT}
     env = _common_env(sides.values(), asked)
     starts = _common_starts(sides.values(), asked)
     for one in (a, b):
@@ -93,12 +91,6 @@ def _check_sources(a: Source, b: Source, asked: Asked) -> None:
         raise InputError(f"'{min(both)}' is on both sides; name another for one of them.")
     if asked.seed is not None and {a.kind, b.kind} != {CHECKPOINT}:
         raise InputError("The starts of these sides are known: leave out --seed.")
-
-
-def _read(source: Source) -> Side:
-    if source.kind == IN_STUDY:
-        return read_study(source.folders[0], source.arm)
-    return read_recorded(source.name, source.folders)
 
 
 def _common_env(known: Collection[Side], asked: Asked) -> Mapping[str, Any]:

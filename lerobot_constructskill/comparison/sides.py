@@ -199,22 +199,25 @@ def _versions(text: str, backend: str) -> dict[str, str]:
     return json.loads(text or "{}") | ({"backend": backend} if backend else {})
 
 
-def read_recorded(name: str, folders: Sequence[Path]) -> Side:
-    """Read episodes that $CONSTRUCTSKILL_RECORD wrote, in a folder for each training seed.
+def read(source: Source) -> Side:
+    """Read a side that needs no evaluation: a study's, or recordings in a folder for each training seed.
 
     Raises:
-        InputError: a file is no recording, a folder has two of one start, or the episodes differ in their conditions.
+        InputError: as `read_study` does; or a file is no recording, a folder has two of one start, or the episodes
+            differ in their conditions.
     """
+    if source.kind == IN_STUDY:
+        return read_study(source.folders[0], source.arm)
     by_folder = {}
-    for folder in folders:
+    for folder in source.folders:
         whole = folder / RECORDINGS  # a study's run has this file alone, $CONSTRUCTSKILL_RECORD writes many
         files = [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
         by_folder[folder] = list(chain(*map(read_recordings, files)))
-    return recorded_side(name, f"recordings of {plural(len(folders), 'training seed')}", by_folder)
+    return recorded_side(source.name, f"recordings of {plural(len(by_folder), 'training seed')}", by_folder)
 
 
 def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Episode]]) -> Side:
-    """Make a side of recordings, by the folder of each training seed. Raises as `read_recorded` does."""
+    """Make a side of recordings, by the folder of each training seed. Raises as `read` does."""
     recordings = list(chain(*by_folder.values()))
     envs = [{name: getattr(one, name) for name in STARTING} for one in recordings]
     for env in envs:

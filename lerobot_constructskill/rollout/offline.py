@@ -142,7 +142,7 @@ def predict(agent: PolicyAgent, dataset: LeRobotDataset, frames: Sequence[int], 
 
     Args:
         agent: any LeRobot policy between its processors.
-        dataset: the data set, as `observed` opens it for this policy.
+        dataset: the data set, as `open_for` opens it for this policy.
         frames: indices of the frames.
         batch_size: frames at a time.
     """
@@ -182,7 +182,7 @@ def spans(dataset: LeRobotDataset, episodes: Sequence[int]) -> list[range]:
     return [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
 
 
-def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
+def open_for(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
     """Open the data set again with as many observations in a frame as the policy was trained on.
 
     A policy class that reads features in place of images has a method `read_features`, which is called here.
@@ -251,7 +251,7 @@ def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[in
     on_gpu = [agent.policy.config.device] if agent.policy.config.device.startswith("cuda") else []
     with observing_frames(dataset), torch.random.fork_rng(on_gpu):
         torch.manual_seed(0)
-        chunks = predict(agent, observed(dataset, agent.policy), frames, BATCH).chunks
+        chunks = predict(agent, open_for(dataset, agent.policy), frames, BATCH).chunks
     actions = np.asarray(dataset.hf_dataset.with_format("numpy")[ACTION][:], dtype=np.float64)
     return _mean_square(chunks, actions, frames, [ends[frame] for frame in frames])
 

@@ -91,9 +91,9 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
     from lerobot_constructskill.rollout.agents import PolicyAgent
     from lerobot_constructskill.rollout.offline import (
         check_actions,
-        observed,
         observing_frames,
         offline_metrics,
+        open_for,
         predict,
         spans,
     )
@@ -101,7 +101,7 @@ def _row(checkpoint: Path, dataset, episodes: list[int], config: OfflineConfig) 
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
-    view = observed(dataset, agent.policy)
+    view = open_for(dataset, agent.policy)
     bar = Progress(spans(dataset, episodes), agent.policy.name, unit="demo", leave=False)
     with observing_frames(dataset):
         predictions = [predict(agent, view, span, config.batch_size) for span in bar]

@@ -77,10 +77,10 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
     assert entries and pages.keys() == {"index", *BOARD_SUITES}
     for entry in entries:
         assert entry.level == "replayed"
-        assert entry.name in pages[entry.said.suite].found["id"]
+        assert entry.name in pages[entry.declaration.suite].found["id"]
         path = tmp_path / "exports" / entry.name / ".eval_results/constructskill.yaml"
-        official = entry.said.settings_class == "standard" and not entry.is_reference
-        tasks = [f"{entry.said.suite}_{one}" for one in entry.standings] if official else []
+        official = entry.declaration.settings_class == "standard" and not entry.is_reference
+        tasks = [f"{entry.declaration.suite}_{one}" for one in entry.standings] if official else []
         results = yaml.safe_load(path.read_text()) if path.exists() else []
         assert [one["dataset"]["task_id"] for one in results] == tasks
         assert all(list(one) == ["dataset", "value", "notes"] for one in results), "in the order of the Hub's page"
@@ -104,18 +104,21 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     bad, few = (next(entry for entry in entries if entry.name == name) for name in ("bad", "few"))
     assert bad.standings["block_to_bin"].errors == 1 and bad.standings["block_to_bin"].placed.value == 0
     assert few.missing_seeds == 8 and not few.is_ranked
-    unseen = replace(good.submission, declaration=replace(good.said, backend="physx_cuda, gpu rendering"))
+    unseen = replace(good.submission, declaration=replace(good.declaration, backend="physx_cuda, gpu rendering"))
     assert not replace(good, submission=unseen).is_ranked, "nobody can replay it"
     twin = replace(good, name="twin")
     assert ranks([good, twin], "block_to_bin") == {"good": (1, True), "twin": (1, True)}
-    easier = replace(good.said, settings={"block_to_bin": replace(good.said.settings["block_to_bin"], episodes=1)})
+    setting = replace(good.declaration.settings["block_to_bin"], episodes=1)
+    easier = replace(good.declaration, settings={"block_to_bin": setting})
     other = replace(good, name="other", submission=replace(good.submission, declaration=easier))
     assert ranks([bad, other], "block_to_bin") == {"bad": (1, False), "other": (1, False)}, "from other starts"
 
 
 def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
     entries = [replace(entry, level=level) for entry in read_entries(BOARD)[0] for level in ("claimed", "replayed")]
-    standard = {entry.name for entry in entries if entry.said.settings_class == "standard" and not entry.is_reference}
+    standard = {
+        entry.name for entry in entries if entry.declaration.settings_class == "standard" and not entry.is_reference
+    }
     write_exports(entries[1::2], tmp_path, "today", "alice/bench")
     assert {path.parts[-3] for path in tmp_path.glob("exports/*/.eval_results/*")} == standard != set()
     write_exports(entries[::2], tmp_path, "today", "alice/bench")

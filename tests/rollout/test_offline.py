@@ -21,9 +21,9 @@ from lerobot_constructskill.rollout.offline import (
     Predictions,
     check_actions,
     heldout_mse,
-    observed,
     observing_frames,
     offline_metrics,
+    open_for,
     policy_errors,
     predict,
     spans,
@@ -90,7 +90,7 @@ def test_a_constant_shift_is_found_in_metres(feature_set):
 
 def test_a_policy_of_two_observations_is_shown_two_and_the_labels_of_one(feature_set):
     asks = SimpleNamespace(observation_delta_indices=[-1, 0], action_delta_indices=[0, 1], reward_delta_indices=None)
-    view = observed(feature_set, SimpleNamespace(config=asks))
+    view = open_for(feature_set, SimpleNamespace(config=asks))
     both = torch.stack([feature_set[frame]["observation.state"] for frame in (4, 5)])
     assert torch.equal(view[5]["observation.state"], both) and view[5]["action"].shape == (4,)
 

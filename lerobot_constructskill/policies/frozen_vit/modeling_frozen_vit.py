@@ -110,13 +110,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         """Return the loss on a batch of chunks, and its terms as floats.
 
         Args:
-            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
-                that finds points also where they are, (B, 2P).
+            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A), and `action_is_pad` (B, T) where some
+                steps lie beyond an episode's end; for a readout that finds points also their positions, (B, 2P).
             reduction: "mean" over all valid steps (of points over samples), or "none" for one loss per sample (B,).
         """
         points = batch[self.config.point_key] if self.readout.points else None
         chunk, read = self.heads(*self.head_inputs(batch))
-        loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], _padded(batch), points, reduction)
+        nothing = torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool)
+        padded = batch.get(f"{ACTION}_is_pad", nothing)
+        loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], padded, points, reduction)
         return loss, {name: term.mean().item() for name, term in terms.items()}
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
@@ -363,11 +365,6 @@ def _read_record(checkpoint: str | Path, options: Mapping[str, Any]) -> EncoderR
             f"The checkpoint '{checkpoint}' has no {RECORD_FILE}, which says what its encoder is "
             f"({first_line(error).rstrip('.')}): copy or push it again with all of its files."
         ) from error
-
-
-def _padded(batch: Mapping[str, Tensor]) -> Tensor:
-    """Return which steps (B, T) lie beyond an episode's end; none where the batch does not say."""
-    return batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
 
 
 def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metadata: dict) -> None:
