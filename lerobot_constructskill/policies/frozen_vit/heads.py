@@ -27,7 +27,7 @@ class ChunkHeads(nn.Module):
         spec = READOUTS[config.readout]
         self.chunk_shape = (config.chunk_size, len(config.action_names) - 1)
         self.action_scale = config.action_scale
-        self.readout = spec.build(feature_dim)
+        self.readout = spec.build(feature_dim) if spec.build else nn.Identity()
         input_dim = spec.dim(feature_dim) + (config.input_features[OBS_STATE].shape[0] if config.use_state else 0)
         hidden = [config.head_hidden_dim] * config.head_hidden_layers if config.head_hidden_dim else []
         self.translation = _head(input_dim, hidden, self.chunk_shape[0] * self.chunk_shape[1])
