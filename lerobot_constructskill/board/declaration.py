@@ -26,19 +26,19 @@ OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
 
 @dataclass(frozen=True)
 class About(Checked):
-    """What a submission must say of its policy.
+    """Description of a submission's policy.
 
     Args:
         name: what the board calls it.
-        submitter: who answers for it.
+        submitter: person or group responsible for the submission.
         policy: its type, and its size where that matters.
         revision: commit or hash by which its checkpoints are found.
-        data: what it was trained on, by name and revision; "none".
-        training: how, and how its training seeds were chosen.
-        compute: on what, and for how long.
+        data: training data, by name and revision; "none" if there are none.
+        training: how it was trained, and how its training seeds were chosen.
+        compute: hardware of the training, and its duration.
         observes: one of `OBSERVES`.
         url: where its checkpoints are.
-        notes: what else a reader must know.
+        notes: anything else that a reader must know.
 
     Raises:
         InputError: a field is no line of text.

@@ -21,7 +21,7 @@ ENTRIES, VERIFIED = "entries", "verified"
 
 @dataclass(frozen=True)
 class Standing:
-    """What an entry reached in one setting.
+    """Result of an entry in one setting.
 
     Args:
         claims: its episodes there, by training seed.
@@ -43,7 +43,7 @@ class Entry:
         name: of its folder; its permalink.
         submission: as it was opened.
         level: one of `protocol.LEVELS`.
-        verdict: what its verification found; empty where nobody verified it.
+        verdict: result of its verification; empty if it was not verified.
     """
 
     name: str

@@ -21,7 +21,7 @@ OnStep = Callable[[int, int, np.ndarray, Step], None]
 
 @dataclass
 class Rollout:
-    """What became of one agent: its episodes, or the exception by which it failed."""
+    """Result of one agent: its episodes, or the exception with which it failed."""
 
     episodes: list[Episode] = field(default_factory=list)
     error: Exception | None = None
@@ -80,7 +80,7 @@ def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class _Lanes:
-    """The agents that still run, and what each of them sees."""
+    """The agents that still run, and the last step of each one's environment."""
 
     def __init__(
         self,

@@ -227,9 +227,9 @@ def policy_errors(
 def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[int], **acting: Any) -> float | None:
     """Mean squared translation error of a checkpoint on some demonstrations, in m2 (of one axis); None without any.
 
-    It is over all steps of the chunks that the policy predicts from single frames, up to a demonstration's end, or
-    over its first actions where it predicts no chunks. Of many frames with pictures, `FRAMES` are looked at, evenly
-    spaced. What a policy samples is drawn from a fixed seed.
+    The mean is over all steps of the chunks that the policy predicts from single frames, up to a demonstration's end.
+    A policy without chunks is judged by its first actions. If the frames have pictures, at most `FRAMES` frames are
+    used, evenly spaced. Policies that sample draw from a fixed seed.
 
     Args:
         dataset: demonstrations, or the features of demonstrations that the policy was trained on.
@@ -257,7 +257,7 @@ def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[in
 
 
 def _mean_square(chunks: np.ndarray, actions: np.ndarray, frames: Sequence[int], ends: Sequence[int]) -> float:
-    """Compare (n, C, A) chunks with the demonstrated actions from each frame on, before its end."""
+    """Mean square of the translation errors of (n, C, A) chunks, each from its frame on, before its end."""
     axes = len(TRANSLATION)
     steps = np.asarray(frames)[:, None] + np.arange(chunks.shape[1])
     valid = steps < np.asarray(ends)[:, None]

@@ -32,10 +32,10 @@ BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
 DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "gripper_head", "action_scale")
-"""Fields that give other numbers of the same shape to the heads, or read other actions out of theirs."""
+"""Fields that change the meaning of the heads' inputs or outputs, and no shape."""
 
 SILENT = 1e-3
-"""A feature whose standard deviation is below this share of the median one is not divided by it."""
+"""A feature whose standard deviation is below this share of the median one counts as constant and is not scaled."""
 
 logger = logging.getLogger(__name__)
 
@@ -188,9 +188,9 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         return model
 
     def _begin_record(self, recorded: EncoderRecord | None) -> EncoderRecord:
-        """Return what is known of the encoder before its weights are there, and settle its precision.
+        """Return the record as far as it is known without weights, and set the precision in the configuration.
 
-        A data set's features say what they are. Otherwise the checkpoint, or without one the configuration, does.
+        The facts come from the data set's features, else from the checkpoint, else from the configuration.
         """
         config, column = self.config, self.config.feature_column
         asked = config.backbone_sha256 or stated(column, "weights_sha256")
@@ -374,5 +374,5 @@ def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metad
 
 
 def _excuse_backbone(policy: FrozenViTChunkPolicy, incompatible: Any) -> None:
-    """Let state dicts be without the backbone, whose hash tells whether it is whole."""
+    """Let a state dict lack the backbone; the hash of the backbone is checked on its own."""
     incompatible.missing_keys[:] = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]

