@@ -238,8 +238,6 @@ def test_heat_maps_learn_where_things_are_and_nothing_acts_on_where_they_are_sai
     assert (last := policy.forward(batch)[1]["point_loss"]) < 0.7 * first, (first, last)
     untold = {name: value for name, value in batch.items() if "points" not in name}
     torch.testing.assert_close(policy.predict_action_chunk(untold), policy.predict_action_chunk(batch))
-    with pytest.raises(InputError, match="--patches=true --points=true"):
-        policy.forward(untold)
 
 
 def test_the_weight_of_the_points_is_the_configured_one(make_policy, make_batch):
