@@ -24,8 +24,6 @@ PRELOADED = [
 ]
 """What every worker imports."""
 
-DIED = "A simulator's process died; if there was not enough memory, run fewer at once."
-
 
 @dataclass(frozen=True)
 class Step:
@@ -80,7 +78,9 @@ class Simulators:
             for future in asked:
                 answers |= future.result()
         except BrokenExecutor:
-            raise MachineError(DIED) from None
+            raise MachineError(
+                "A simulator's process died; if there was not enough memory, run fewer at once."
+            ) from None
         return answers
 
 
