@@ -11,7 +11,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
-from lerobot_constructskill.rollout.heldout import heldout_mse
+from lerobot_constructskill.rollout.offline import heldout_mse
 
 DINOV2 = {"standardize_features": True}  # configs/train/frozen_vit_fast.yaml
 

@@ -1,7 +1,7 @@
 """Lift and place counts per training seed, from what LeRobot's scripts wrote: `count_outcomes.py FOLDER`.
 
 Reads FOLDER/eval/seed_*/eval_info.json (the reward of a step is the stage reached, so an episode's largest reward
-tells whether it lifted and placed) and the held-out error in FOLDER/train_*.log.
+tells whether it lifted and placed) and the held-out loss in FOLDER/train_*.log.
 """
 
 import re
@@ -12,11 +12,11 @@ from lerobot_constructskill.scripts.push_policy import seed_outcomes
 
 
 def main(folder: Path) -> None:
-    print("| seed | lifted | placed | held-out translation error (1e-4 m2) |\n|---:|---:|---:|---:|")
+    print("| seed | lifted | placed | held-out loss |\n|---:|---:|---:|---:|")
     outcomes = seed_outcomes(folder / "eval")
     for seed, lifted, placed, episodes in outcomes:
-        error = re.findall(r"heldout_translation_mse_m2=(\S+)", (folder / f"train_{seed}.log").read_text())[-1]
-        print(f"| {seed} | {lifted}/{episodes} | {placed}/{episodes} | {float(error) * 1e4:.2f} |")
+        loss = re.findall(r"eval_loss=(\S+)", (folder / f"train_{seed}.log").read_text())[-1]
+        print(f"| {seed} | {lifted}/{episodes} | {placed}/{episodes} | {loss} |")
     lifted_seeds, placed_seeds = (sum(outcome[i] > 0 for outcome in outcomes) for i in (1, 2))
     print(f"\nSeeds that lifted: {lifted_seeds} of {len(outcomes)}; that placed: {placed_seeds} of {len(outcomes)}.")
     videos = sorted(folder.glob("eval/seed_*/videos/**/*.mp4"))

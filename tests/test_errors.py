@@ -180,8 +180,8 @@ def test_the_traceback_tells_what_a_sentence_hides() -> None:
         assert "KeyError: 'the cause'" in full_traceback(error)
 
 
-def test_a_traceback_comes_home_from_a_simulators_process() -> None:
-    from lerobot_constructskill.rollout.simulators import _attempt, _reset
+def test_a_traceback_comes_home_from_a_simulators_process(monkeypatch) -> None:
+    from lerobot_constructskill.rollout.simulators import _attempt, _environments, _reset
 
     class Broken:
         def reset(self, seed):
@@ -195,10 +195,12 @@ def test_a_traceback_comes_home_from_a_simulators_process() -> None:
         def reset(self, seed):
             raise OddError(seed, 8)
 
-    error = pickle.loads(pickle.dumps(_attempt(_reset, Broken(), 7)))
+    monkeypatch.setitem(_environments, 0, Broken())
+    monkeypatch.setitem(_environments, 1, Odder())
+    error = pickle.loads(pickle.dumps(_attempt(_reset, 0, 7)))
     assert type(error) is KeyError and error.args == (7,)
     assert "in reset\n    raise KeyError(seed)" in full_traceback(error)
-    error = pickle.loads(pickle.dumps(_attempt(_reset, Odder(), 7)))
+    error = pickle.loads(pickle.dumps(_attempt(_reset, 1, 7)))
     assert type(error) is RuntimeError and str(error) == "OddError: 7 and 8"
 
 

@@ -25,7 +25,7 @@ from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.artifacts.tables import Parquet
 from lerobot_constructskill.board.from_recordings import recorded_by_study
 from lerobot_constructskill.board.protocol import BoardSetting
-from lerobot_constructskill.comparison.read import read_study
+from lerobot_constructskill.comparison.sides import read_study
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import Json, Yaml, bounded_memory, parse_yaml, read_bytes, read_parquet, read_text
 from lerobot_constructskill.policy_types import read_policy

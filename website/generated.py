@@ -33,7 +33,7 @@ INTERFACE = {
     "Studies": ["study.spec", "training.recipe", "training.trainers", "study.rows"],
     "Statistics": [
         f"analysis.stats.{name}"
-        for name in ("outcomes", "intervals", "comparisons", "correlation", "judgement", "power", "spread")
+        for name in ("outcomes", "intervals", "comparisons", "correlation", "judgement", "power")
     ],
 }
 """Title of a page to the public modules and classes on it."""
@@ -97,7 +97,7 @@ def policies(root: Path) -> dict[str, list[str]]:
         name, analysis, rows = read_study(folder)
         envs, runs = read_environments(folder), runs_of(rows[rows["error_kind"].isna()])
         for (setting, variant), own in runs.groupby(["setting", "variant"]):
-            lifted, placed = ("{}/{}".format(*count(own, criterion)) for criterion in ("lifted", "placed"))
+            lifted, placed = ("{}/{}".format(*count(own[f"{criterion}_rate"])) for criterion in ("lifted", "placed"))
             cells = (analysis.label(variant), lifted, placed, f"{own['placed'].sum()}/{own['episodes'].sum()}")
             link = f"[{name}](../../results/{folder.name}/report.md)"
             outcomes[envs[setting]["task"]].append(f"| {' | '.join(cells)} | {link} |")

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
-from lerobot_constructskill.bounds import UNSEEN, Among, NotEmpty, Pattern, Seed, check
+from lerobot_constructskill.bounds import UNSEEN, Among, Checked, NotEmpty, Pattern, Seed, check
 from lerobot_constructskill.contract import OBS_TYPES, TASKS, get_task
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Yaml
@@ -25,20 +25,20 @@ OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
 
 
 @dataclass(frozen=True)
-class About:
-    """What a submission must say of its policy.
+class About(Checked):
+    """Description of a submission's policy.
 
     Args:
         name: what the board calls it.
-        submitter: who answers for it.
+        submitter: person or group responsible for the submission.
         policy: its type, and its size where that matters.
         revision: commit or hash by which its checkpoints are found.
-        data: what it was trained on, by name and revision; "none".
-        training: how, and how its training seeds were chosen.
-        compute: on what, and for how long.
+        data: training data, by name and revision; "none" if there are none.
+        training: how it was trained, and how its training seeds were chosen.
+        compute: hardware of the training, and its duration.
         observes: one of `OBSERVES`.
         url: where its checkpoints are.
-        notes: what else a reader must know.
+        notes: anything else that a reader must know.
 
     Raises:
         InputError: a field is no line of text.
@@ -54,9 +54,6 @@ class About:
     observes: Annotated[str, Among(OBSERVES)]
     url: Link | None = None
     notes: Line | None = None
-
-    def __post_init__(self):
-        check(self)
 
     @property
     def is_policy(self) -> bool:

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.analysis.stats.intervals import Estimate
-from lerobot_constructskill.analysis.stats.spread import mean_rate
+from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission
@@ -22,7 +21,7 @@ ENTRIES, VERIFIED = "entries", "verified"
 
 @dataclass(frozen=True)
 class Standing:
-    """What an entry reached in one setting.
+    """Result of an entry in one setting.
 
     Args:
         claims: its episodes there, by training seed.
@@ -44,7 +43,7 @@ class Entry:
         name: of its folder; its permalink.
         submission: as it was opened.
         level: one of `protocol.LEVELS`.
-        verdict: what its verification found; empty where nobody verified it.
+        verdict: result of its verification; empty if it was not verified.
     """
 
     name: str
@@ -53,28 +52,28 @@ class Entry:
     verdict: dict[str, Any]
 
     @property
-    def said(self) -> Declaration:
+    def declaration(self) -> Declaration:
         return self.submission.declaration
 
     @property
     def is_reference(self) -> bool:
         """Whether it is a floor or a ceiling, which has no rank and lacks no seeds."""
-        return not self.said.about.is_policy
+        return not self.declaration.about.is_policy
 
     @property
     def is_ranked(self) -> bool:
-        is_checked = self.level != CLAIMED and self.said.is_replayable
-        return is_checked and not self.is_reference and len(self.said.training_seeds) >= RANKED_FROM
+        is_checked = self.level != CLAIMED and self.declaration.is_replayable
+        return is_checked and not self.is_reference and len(self.declaration.training_seeds) >= RANKED_FROM
 
     @property
     def missing_seeds(self) -> int:
         """How many of the protocol's training seeds it lacks."""
-        return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.said.training_seeds})
+        return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.declaration.training_seeds})
 
     @cached_property
     def standings(self) -> dict[str, Standing]:
         """What it reached in each of its settings, by name."""
-        return {name: self._standing(name) for name in self.said.settings}
+        return {name: self._standing(name) for name in self.declaration.settings}
 
     def _standing(self, setting: str) -> Standing:
         there = sorted((one for one in self.submission.claims if one.setting == setting), key=lambda one: one.key)
@@ -86,27 +85,28 @@ class Entry:
         return Standing(claims, placed, lifted, errors=sum(one.error is not None for one in there))
 
 
-class Read(NamedTuple):
-    """What was read of a board: its entries by name, and of each that cannot be read a sentence that names it."""
+def read_entries(root: Path) -> tuple[list[Entry], list[str]]:
+    """Read every entry of a board's folder.
 
-    entries: list[Entry]
-    refused: list[str]
+    Returns:
+        The entries in the order of their names, and a sentence for each entry that cannot be read.
 
-
-def read_entries(root: Path) -> Read:
-    """Every entry of a board's folder. Raises MissingError where there is no such folder."""
+    Raises:
+        MissingError: there is no such folder.
+        InputError: the board's verdicts are no folder.
+    """
     if not (root / ENTRIES).is_dir():
         raise MissingError(f"'{root}' is not a board: it has no folder '{ENTRIES}'.")
     if (root / VERIFIED).exists() and not (root / VERIFIED).is_dir():
         raise InputError(f"'{root / VERIFIED}' is not a folder of verdicts.")
-    read = Read([], [])
+    entries, refused = [], []
     for path in sorted((root / ENTRIES).iterdir()):
         if path.suffix != ".partial":  # an entry is being written, or was when its process was killed
             try:
-                read.entries.append(_entry(root, path))
+                entries.append(_entry(root, path))
             except (InputError, MissingError) as error:
-                read.refused.append(f"Entry {path.name!a}: {error}")
-    return read
+                refused.append(f"Entry {path.name!a}: {error}")
+    return entries, refused
 
 
 def _entry(root: Path, path: Path) -> Entry:
@@ -127,7 +127,7 @@ def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     alike: dict[tuple, dict[str, Estimate]] = {}
     for entry in entries:
         if entry.is_ranked and setting in entry.standings:
-            kind = entry.said.settings_class, entry.said.settings[setting].compared
+            kind = entry.declaration.settings_class, entry.declaration.settings[setting].compared
             alike.setdefault(kind, {})[entry.name] = entry.standings[setting].placed
     found = {}
     for placed in alike.values():

@@ -28,8 +28,8 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
         {
             "entry": entry.name,
             "sha256": entry.submission.sha256,
-            "suite": entry.said.suite,
-            "class": entry.said.settings_class,
+            "suite": entry.declaration.suite,
+            "class": entry.declaration.settings_class,
             "level": entry.level,
             "task": claim.task,
             **{name: getattr(claim, name) for name in SCHEMA.names if name != "actions"},
@@ -89,14 +89,14 @@ def eval_results(entry: Entry, dataset_id: str) -> str:
     """
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
-    about = entry.said.about
-    seeds = f"mean of {len(entry.said.training_seeds)} training seeds, {entry.level}, {entry.said.settings_class}"
+    said = entry.declaration
+    seeds = f"mean of {len(said.training_seeds)} training seeds, {entry.level}, {said.settings_class}"
     results = [
         EvalResultEntry(
             dataset_id=dataset_id,
-            task_id=f"{entry.said.suite}_{setting}",
+            task_id=f"{said.suite}_{setting}",
             value=round(100 * standing.placed.value, 2),
-            notes=f"{about.name}; per cent placed, {seeds}; submission {entry.submission.sha256[:16]}",
+            notes=f"{said.about.name}; per cent placed, {seeds}; submission {entry.submission.sha256[:16]}",
         )
         for setting, standing in entry.standings.items()
     ]
@@ -115,14 +115,15 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
     results = [
         {
             "model": entry.name,
-            "display_name": entry.said.about.name,
-            "benchmark": f"constructskill_{entry.said.suite}",
+            "display_name": entry.declaration.about.name,
+            "benchmark": f"constructskill_{entry.declaration.suite}",
             "weight_type": "finetuned",
             "overall_score": None,
             "task_scores": {name: round(100 * one.placed.value, 2) for name, one in entry.standings.items()},
             "curated_by": "constructskill-api",
             "date_added": entry.verdict["date"],
-            "notes": f"{len(entry.said.training_seeds)} training seeds; {entry.level} by constructskill-verify.",
+            "notes": f"{len(entry.declaration.training_seeds)} training seeds; {entry.level} by "
+            "constructskill-verify.",
         }
         for entry in entries
         if _is_official(entry)
@@ -132,7 +133,7 @@ def harness_board(entries: Iterable[Entry], day: str) -> dict[str, Any]:
 
 def _is_official(entry: Entry) -> bool:
     """Whether an entry is a policy on the suite's own settings, whose names others know, and was replayed."""
-    return entry.said.settings_class == STANDARD and not entry.is_reference and entry.level != CLAIMED
+    return entry.declaration.settings_class == STANDARD and not entry.is_reference and entry.level != CLAIMED
 
 
 def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | None) -> None:
@@ -149,7 +150,7 @@ def write_exports(entries: list[Entry], out: Path, day: str, dataset_id: str | N
             file.parents[1].rmdir()
     write_text(exports / "leaderboard.json", json.dumps(harness_board(entries, day), indent=2) + "\n")
     for entry in entries:
-        for seed in entry.said.training_seeds:
+        for seed in entry.declaration.training_seeds:
             text = json.dumps(eval_info(entry, seed), indent=2) + "\n"
             write_text(exports / entry.name / f"seed_{seed}" / EVAL_INFO, text)
         if dataset_id and _is_official(entry):

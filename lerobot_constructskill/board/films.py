@@ -39,7 +39,7 @@ def write_films(entries: Sequence[Entry], out: Path) -> None:
 
 def _films(entry: Entry, setting: str) -> dict[str, Claim]:
     """The first episode of a setting that placed and the first that did not; another submission's have other paths."""
-    if not entry.said.is_replayable:
+    if not entry.declaration.is_replayable:
         return {}
     claims = [one for own in entry.standings[setting].claims.values() for one in own if one.error is None]
     firsts = [next((one for one in claims if one.placed == placed), None) for placed in (True, False)]

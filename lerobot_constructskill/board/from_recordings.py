@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from lerobot_constructskill.board.declaration import About
-from lerobot_constructskill.board.protocol import BoardSetting, where
+from lerobot_constructskill.board.protocol import BoardSetting, environment_key
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
@@ -83,12 +83,14 @@ def _alike(
 ) -> list[str]:
     """Those settings of a study that a variant `ran` in and that evaluate as one of `settings` does."""
     places = {
-        name: where(env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0))
+        name: environment_key(
+            env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0)
+        )
         for name, env in read_environments(root).items()
     }
     if unknown := [name for name in chosen or () if name not in places]:
         raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(places)}.")
-    asked = [where(**setting.environment) for setting in settings.values()]
+    asked = [environment_key(**setting.environment) for setting in settings.values()]
     ran = {name: places[name] for name in ran if name in (chosen or places)}
     alike = {name: place for name, place in ran.items() if place in asked}
     if not alike:
@@ -127,8 +129,8 @@ def submit(
     claims = []
     for seed in seeds:
         for name, setting in settings.items():
-            place = where(**setting.environment)
-            there = [one for one in recorded.get(seed, []) if where(**one.environment) == place]
+            place = environment_key(**setting.environment)
+            there = [one for one in recorded.get(seed, []) if environment_key(**one.environment) == place]
             for start in setting.starts:
                 found = [one for one in there if one.evaluation_seed == start]
                 missing = Claim(start, setting=name, training_seed=seed, error=failures.get(seed))

@@ -103,10 +103,10 @@ class BoardSetting:
     @property
     def compared(self) -> tuple:
         """Equal for settings whose results can be compared: they are the same but for their names."""
-        return where(**self.environment), self.starts
+        return environment_key(**self.environment), self.starts
 
 
-def where(
+def environment_key(
     task: str, episode_length: int | None = None, perturb: str = "", perturb_seed: int = 0
 ) -> tuple[str, int, str]:
     """Task, length and perturbation of an environment with these arguments: what beside a start decides an episode."""

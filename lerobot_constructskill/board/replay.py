@@ -19,7 +19,7 @@ TOGETHER = 8
 """Episodes that a worker replays in one simulator, one after another."""
 
 SHOWN = 10
-"""Number of differences that are told in full."""
+"""Number of differences that a message lists."""
 
 OTHER_MAKE = (
     " Makes of processors differ in the last bits of physics, on which an episode seldom depends: verify it on the "

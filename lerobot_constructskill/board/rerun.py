@@ -5,8 +5,7 @@ from dataclasses import asdict
 import numpy as np
 import yaml
 
-from lerobot_constructskill.analysis.stats.comparisons import holm
-from lerobot_constructskill.analysis.stats.spread import mean_p_value
+from lerobot_constructskill.analysis.stats.comparisons import holm, mean_p_value
 from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.contract import OBS_TYPES

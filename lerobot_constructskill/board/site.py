@@ -53,9 +53,9 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
 
 
 def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
-    own = [entry for entry in entries if entry.said.suite == name]
+    own = [entry for entry in entries if entry.declaration.suite == name]
     suite = BOARD_SUITES[name]
-    columns = list(dict.fromkeys([*suite.settings, *(one for entry in own for one in entry.said.settings)]))
+    columns = list(dict.fromkeys([*suite.settings, *(one for entry in own for one in entry.declaration.settings)]))
     ranked = {column: ranks(own, column) for column in columns}
     return _render(
         "suite.html",
@@ -79,7 +79,7 @@ def _place(entry: Entry, ranked: dict[str, dict[str, tuple[int, bool]]]) -> tupl
     """Key to sort entries by: policies first, then by class, by ranks from the worst on, by rates, by name."""
     own = sorted((of[entry.name][0] for of in ranked.values() if entry.name in of), reverse=True)
     rates = [standing.placed.value for standing in entry.standings.values()]
-    kind = CLASSES.index(entry.said.settings_class)
+    kind = CLASSES.index(entry.declaration.settings_class)
     return entry.is_reference, kind, not entry.is_ranked, own, -sum(rates) / len(rates), entry.name
 
 

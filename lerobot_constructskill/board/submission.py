@@ -165,28 +165,45 @@ def _check_keys(declaration: Declaration, keys: list[tuple[str, int, int]]) -> N
 
 def _check(claim: Claim) -> None:
     """Refuse an episode that contradicts itself, as far as that shows without executing it."""
-    if claim.error is not None:
-        _require(claim, LINE.allows(claim.error), f"error must be {LINE.meaning}")
-        is_empty = claim.outcome == Episode(claim.evaluation_seed).outcome and not len(claim.flat)
-        _require(claim, is_empty, "an episode with an error has neither outcome nor actions")
-        return
-    names = get_task(claim.task).action_names
-    _require(claim, claim.stage in STAGES, f"stage must be one of {', '.join(STAGES)}")
-    _require(claim, 1 <= claim.steps <= claim.episode_length, f"steps must be 1 to {claim.episode_length}")
-    _require(claim, len(claim.flat) == claim.steps * len(names), f"each action must have {len(names)} numbers")
-    _require(claim, np.isfinite(claim.flat).all(), "actions must be finite")
-    is_told = claim.placed == (claim.stage == "placed") and claim.lifted >= (claim.stage == "lifted")
-    _require(claim, is_told, f"stage {claim.stage} is not what lifted and placed say")
-    for name, did, step in (("lift", claim.lifted, claim.lift_step), ("place", claim.placed, claim.place_step)):
-        _require(claim, did == (step is not None), f"there is a {name}_step exactly where that happened")
-        _require(claim, not did or 1 <= step <= claim.steps, f"{name}_step must be 1 to {claim.steps}")
-    is_over = not claim.placed or claim.place_step == claim.steps
-    _require(claim, is_over, f"the placement ends an episode, so place_step must be {claim.steps}")
+    for holds, rule in _rules(claim) if claim.error is None else _rules_of_failed(claim):
+        if not holds:
+            raise InputError(f"{claim.label}: {rule}.")
 
 
-def _require(claim: Claim, holds: bool, rule: str) -> None:
-    if not holds:
-        raise InputError(f"{claim.label}: {rule}.")
+def _rules_of_failed(claim: Claim) -> list[tuple[bool, str]]:
+    is_empty = claim.outcome == Episode(claim.evaluation_seed).outcome and not len(claim.flat)
+    return [
+        (LINE.allows(claim.error), f"error must be {LINE.meaning}"),
+        (is_empty, "an episode with an error has neither outcome nor actions"),
+    ]
+
+
+def _rules(claim: Claim) -> list[tuple[bool, str]]:
+    """Whether each rule for an episode that ran to its end holds, and the rule."""
+    numbers, steps, stage = len(get_task(claim.task).action_names), claim.steps, claim.stage
+    return [
+        (stage in STAGES, f"stage must be one of {', '.join(STAGES)}"),
+        (1 <= steps <= claim.episode_length, f"steps must be 1 to {claim.episode_length}"),
+        (len(claim.flat) == steps * numbers, f"each action must have {numbers} numbers"),
+        (np.isfinite(claim.flat).all(), "actions must be finite"),
+        (
+            claim.placed == (stage == "placed") and claim.lifted >= (stage == "lifted"),
+            f"stage {stage} is not what lifted and placed say",
+        ),
+        *_rules_of_step("lift", claim.lifted, claim.lift_step, steps),
+        *_rules_of_step("place", claim.placed, claim.place_step, steps),
+        (
+            not claim.placed or claim.place_step == steps,
+            f"the placement ends an episode, so place_step must be {steps}",
+        ),
+    ]
+
+
+def _rules_of_step(name: str, happened: bool, step: int | None, steps: int) -> list[tuple[bool, str]]:
+    return [
+        (happened == (step is not None), f"there is a {name}_step exactly where that happened"),
+        (step is None or 1 <= step <= steps, f"{name}_step must be 1 to {steps}"),
+    ]
 
 
 def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:

@@ -5,8 +5,7 @@ from itertools import batched
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.comparison.read import Source, recorded_side
-from lerobot_constructskill.comparison.sides import Side, conditions
+from lerobot_constructskill.comparison.sides import Side, Source, conditions, recorded_side
 from lerobot_constructskill.envs.recording import RECORDINGS, write_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent

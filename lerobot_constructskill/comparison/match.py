@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.judgement import Judgement, judge
-from lerobot_constructskill.comparison.read import (
+from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
-    EVALUATED,
-    IN_STUDY,
+    Side,
     Source,
-    read_evaluated,
-    read_recorded,
-    read_study,
+    check_equal,
+    conditions,
+    read,
 )
-from lerobot_constructskill.comparison.sides import Side, check_equal, conditions
 from lerobot_constructskill.errors import InputError
 
 FIRST_START, EPISODES = 1000, 50
@@ -73,11 +71,8 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
         InputError: a side cannot be read, or nothing of it can be compared with the other.
     """
     _check_sources(a, b, asked)
-    sides = {one: _read(one) for one in (a, b) if one.kind not in (CHECKPOINT, EVALUATED)}
+    sides = {one: read(one) for one in (a, b) if one.kind != CHECKPOINT}
     env = _common_env(sides.values(), asked)
-    for one in (a, b):
-        if one.kind == EVALUATED:
-            sides[one] = read_evaluated(one.name, one.folders, asked.seed, env)
     starts = _common_starts(sides.values(), asked)
     for one in (a, b):
         if one.kind == CHECKPOINT:
@@ -94,15 +89,8 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
 def _check_sources(a: Source, b: Source, asked: Asked) -> None:
     if a.arm == b.arm and (both := {*map(Path.resolve, a.folders)} & {*map(Path.resolve, b.folders)}):
         raise InputError(f"'{min(both)}' is on both sides; name another for one of them.")
-    kinds = {a.kind, b.kind}
-    if asked.seed is not None and EVALUATED not in kinds and kinds != {CHECKPOINT}:
+    if asked.seed is not None and {a.kind, b.kind} != {CHECKPOINT}:
         raise InputError("The starts of these sides are known: leave out --seed.")
-
-
-def _read(source: Source) -> Side:
-    if source.kind == IN_STUDY:
-        return read_study(source.folders[0], source.arm)
-    return read_recorded(source.name, source.folders)
 
 
 def _common_env(known: Collection[Side], asked: Asked) -> Mapping[str, Any]:

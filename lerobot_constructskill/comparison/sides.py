@@ -1,34 +1,54 @@
-"""One side of a comparison: training seeds of a policy, where they were evaluated, and the result of each start."""
+"""The sides of a comparison: training seeds of a policy, where they were evaluated, and the result of each start."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from glob import glob
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from lerobot_constructskill.contract import OBS_TYPES, get_task
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode, read_recordings
+from lerobot_constructskill.errors import InputError, MissingError, plural
+from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_environments, read_rows
 
 Placements = Mapping[int, bool]
 """Start (seed of an evaluation episode) to whether the episode placed the object."""
 
+IN_STUDY, CHECKPOINT, RECORDED = "study", "checkpoint", "recordings"
+"""Kinds of sources."""
 
-@dataclass
+CONTENTS = (
+    (CHECKPOINT, Path(), "config.json"),
+    (CHECKPOINT, LAST_CHECKPOINT, "config.json"),
+    (CHECKPOINT, Path("pretrained_model"), "config.json"),
+    (RECORDED, Path(), "[!.]*.parquet"),
+)
+"""Kind, inner folder, and a file in it."""
+
+
+@dataclass(frozen=True)
 class Side:
     """One side of a comparison.
 
     Args:
         name: what the user called it.
         kind: what it was read from, such as "10 training seeds of a study".
-        env: keyword arguments of the `ConstructSkillEnv` that it was evaluated in; None if unknown.
+        env: keyword arguments of the `ConstructSkillEnv` that it was evaluated in.
         seeds: placements of each training seed; None for a seed whose training or evaluation failed.
         versions: packages, processor and simulator that its episodes were made with.
     """
 
     name: str
     kind: str
-    env: Mapping[str, Any] | None = None
-    seeds: list[Placements | None] = field(default_factory=list)
-    versions: dict[str, str] = field(default_factory=dict)
+    env: Mapping[str, Any]
+    seeds: list[Placements | None]
+    versions: dict[str, str]
 
     @property
     def starts(self) -> set[int] | None:
@@ -80,3 +100,136 @@ def merge_versions(many: Iterable[Mapping[str, Any]]) -> dict[str, str]:
         for name, value in versions.items():
             merged.setdefault(name, {})[str(value)] = None
     return {name: ", ".join(values) for name, values in merged.items()}
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a side is read from.
+
+    Args:
+        name: what the user typed.
+        kind: `IN_STUDY`, `CHECKPOINT` or `RECORDED`.
+        folders: the study's folder, or one folder for each training seed.
+        arm: setting/variant of a study.
+    """
+
+    name: str
+    kind: str
+    folders: tuple[Path, ...]
+    arm: str = ""
+
+
+def find(text: str) -> Source:
+    """Find the source of a side.
+
+    Args:
+        text: a study's folder, ":" and setting/variant; or folders separated by commas, or patterns such as
+            `outputs/mine/train/seed_*`, of checkpoints, of `lerobot-train` or of recordings.
+
+    Raises:
+        MissingError: there is no such folder.
+        InputError: the folders hold nothing of this, are of several kinds, or one is named twice.
+    """
+    root, _, arm = text.rpartition(":") if ":" in text else (text, "", "")
+    if (Path(root) / STUDY).is_file():
+        return Source(text, IN_STUDY, (Path(root),), arm)
+    found: list[tuple[str, Path]] = []
+    for pattern in text.split(","):
+        folders = sorted(Path(name) for name in glob(pattern.strip()) if Path(name).is_dir())
+        if not folders:
+            raise MissingError(f"There is no folder '{pattern.strip()}'.")
+        found += map(_recognize, folders)
+    kinds, folders = zip(*found, strict=True)
+    if len(set(kinds)) > 1:
+        raise InputError(f"'{text}' is of several kinds ({', '.join(sorted({*kinds}))}); a side is of one kind.")
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError(f"'{text}' names a folder twice; each training seed counts once.")
+    return Source(text, kinds[0], folders)
+
+
+def _recognize(folder: Path) -> tuple[str, Path]:
+    """The kind of a folder, and the folder in it to read."""
+    for kind, inner, file in CONTENTS:
+        if any((folder / inner).glob(file)):
+            return kind, folder / inner
+    raise InputError(
+        f"'{folder}' is no checkpoint (config.json), no output of lerobot-train ({LAST_CHECKPOINT}), and has no "
+        "recordings (*.parquet)."
+    )
+
+
+def read_study(root: Path, arm: str) -> Side:
+    """Read those training seeds of a study's setting/variant, or setting/reference, that were run.
+
+    Raises:
+        MissingError: the folder is not that of a study.
+        InputError: its files cannot be read, or it has no such variant, or no run of it.
+    """
+    check_folder(root)
+    rows = read_rows(root / ROWS)
+    arms = rows["setting"] + "/" + rows["variant"]
+    if arm not in set(arms):
+        known = ", ".join(dict.fromkeys(arms))
+        raise InputError(f"'{root}' has no variant '{arm}'; name one as in {root}:setting/variant; it has: {known}.")
+    rows = rows[(arms == arm) & (rows["error_kind"].fillna("") != NOT_RUN)]
+    if rows.empty:
+        raise InputError(f"No run of '{arm}' in '{root}' has been made.")
+    setting, envs = arm.partition("/")[0], read_environments(root)
+    if setting not in envs:
+        raise InputError(f"'{root / STUDY}' does not say how '{setting}' is evaluated.")
+    made_with = rows[["versions", "backend"]].drop_duplicates().fillna("").itertuples(index=False)
+    return Side(
+        name=f"{root}:{arm}",
+        kind=f"{plural(rows['training_seed'].nunique(), 'training seed')} of a study",
+        env=envs[setting],
+        seeds=[_placements_of_rows(own) for _, own in rows.groupby("training_seed", sort=True)],
+        versions=merge_versions(_versions(text, backend) for text, backend in made_with),
+    )
+
+
+def _placements_of_rows(rows: pd.DataFrame) -> Placements | None:
+    if rows["error_kind"].notna().any():
+        return None
+    if rows["placed"].isna().any() or rows["evaluation_seed"].duplicated().any():
+        raise InputError(f"The rows of {rows['variant'].iloc[0]} lack a placement, or have two of one start.")
+    return dict(zip(rows["evaluation_seed"].astype(int), rows["placed"].astype(bool), strict=True))
+
+
+def _versions(text: str, backend: str) -> dict[str, str]:
+    return json.loads(text or "{}") | ({"backend": backend} if backend else {})
+
+
+def read(source: Source) -> Side:
+    """Read a side that needs no evaluation: a study's, or recordings in a folder for each training seed.
+
+    Raises:
+        InputError: as `read_study` does; or a file is no recording, a folder has two of one start, or the episodes
+            differ in their conditions.
+    """
+    if source.kind == IN_STUDY:
+        return read_study(source.folders[0], source.arm)
+    by_folder = {}
+    for folder in source.folders:
+        whole = folder / RECORDINGS  # a study's run has this file alone, $CONSTRUCTSKILL_RECORD writes many
+        files = [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
+        by_folder[folder] = list(chain(*map(read_recordings, files)))
+    return recorded_side(source.name, f"recordings of {plural(len(by_folder), 'training seed')}", by_folder)
+
+
+def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Episode]]) -> Side:
+    """Make a side of recordings, by the folder of each training seed. Raises as `read` does."""
+    recordings = list(chain(*by_folder.values()))
+    envs = [{name: getattr(one, name) for name in STARTING} for one in recordings]
+    for env in envs:
+        check_equal(f"The recordings of '{name}'", envs[0], env)
+    for folder, own in by_folder.items():
+        starts = [one.evaluation_seed for one in own]
+        if twice := [start for start in starts if starts.count(start) > 1]:
+            raise InputError(
+                f"'{folder}' has two recordings of start {twice[0]}: record each training seed into its own folder."
+            )
+    versions = merge_versions(_versions(one.versions, one.backend) for one in recordings)
+    if "processor" in versions:
+        versions["processor's maker"] = versions.pop("processor")  # in a study's rows, "processor" is its full name
+    seeds = [{one.evaluation_seed: one.placed for one in own} for own in by_folder.values()]
+    return Side(name, kind, envs[0], seeds, versions)

@@ -48,9 +48,6 @@ def _sides(matched: MatchedSides) -> str:
         "A": (matched.a, judgement.counts_a, judgement.mean_a, matched.rates_a),
         "B": (matched.b, judgement.counts_b, judgement.mean_b, matched.rates_b),
     }
-    for letter, (side, *_) in sides.items():
-        if side.env is None:
-            lines.append(f"lerobot-eval does not write where it evaluated: {letter} is taken to be from there")
     lines += ["", f"   {'seeds that placed':<19}{'episodes placed, mean of seeds':<32}each seed, of {len(starts)}"]
     for letter, (side, counts, mean, rates) in sides.items():
         each = [f"{rate * len(starts):.0f}" for rate in rates]
@@ -84,21 +81,16 @@ def _power(judgement: Judgement, alpha: float) -> str:
             f"{plural(a, 'seed')} against {b} can show no difference, however large: their p-value is at least "
             f"{judgement.smallest_p_value:.2g}. Train more seeds."
         )
-    told = f"{_points(judgement.visible_at_worst)}, if each seed places always or never"
-    if judgement.visible is not None:
-        told = f"{_points(judgement.visible)}, if seeds vary as these do; {told}"
-    told = f"With this many seeds, {TARGET:.0%} of comparisons would find: {told}."
+    visible = judgement.visible
+    if visible is None:
+        return "Seeds do not vary on either side, so how large a difference would be found cannot be told."
+    found = "no difference, however large" if visible > 1 else f"a difference of {visible * 100:.0f} points"
+    told = f"With this many seeds, {TARGET:.0%} of comparisons would find {found}, if seeds vary as these do."
     needed = judgement.seeds_needed
     if judgement.conclusion is Conclusion.INCONCLUSIVE and needed is not None:
         number = f"more than {MOST}" if needed == inf else f"about {needed}"
         told += f" To find the difference that was seen, {number} seeds a side would be needed."
     return told
-
-
-def _points(difference: float | None) -> str:
-    if not difference or difference > 1:
-        return "no difference, however large"
-    return f"a difference of {difference * 100:.0f} points"
 
 
 def _versions(matched: MatchedSides) -> str:

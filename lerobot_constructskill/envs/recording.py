@@ -28,16 +28,16 @@ FOLDER = "CONSTRUCTSKILL_RECORD"
 """Environment variable: where to record."""
 
 RECORDINGS = "recordings.parquet"
-"""Where a study's run keeps what it executed."""
+"""File of a study's run: the episodes that it executed."""
 
 ENVIRONMENT = ("task", "episode_length", "perturb", "perturb_seed")
 """Arguments of `ConstructSkillEnv` that with a seed decide an episode's start and its end."""
 
 STARTING = (*ENVIRONMENT, "obs_type")
-"""The same and what a policy is shown."""
+"""`ENVIRONMENT`, and the observation that a policy is shown."""
 
 OUTCOME = ("lifted", "placed", "stage", "lift_step", "place_step", "steps")
-"""Fields of `Episode` that executing its actions again has to come to."""
+"""Fields of `Episode` that executing its actions again must reproduce."""
 
 DECIDING = ("sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
@@ -63,8 +63,8 @@ class Episode:
         obs_type: what the policy was shown.
         backend: what simulated and rendered, as `ConstructSkillEnv.backend`.
         versions: JSON, as `deciding` gives them.
-        clipped_steps: how many of the actions were clipped; None where nobody counted.
-        final_error_m: distance of the object from the goal's centre at the end, in metres; None where not measured.
+        clipped_steps: how many of the actions were clipped; None if not counted.
+        final_error_m: distance of the object from the goal's centre at the end, in metres; None if not measured.
         actions: every executed action in order, in pieces whose concatenation is (steps * A) float32, as
             `ConstructSkillEnv.step` takes them.
     """
@@ -88,7 +88,7 @@ class Episode:
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
-        """Count an executed action, (A,), of which the environment said `info`, and keep a copy of it."""
+        """Add an executed action, (A,), and what the environment returned as `info` for it."""
         self.actions.append(np.array(action, dtype=np.float32))
         self.steps += 1
         self.clipped_steps = info["clipped_steps"]

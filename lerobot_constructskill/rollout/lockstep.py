@@ -3,13 +3,15 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.contract import OBS_TYPES, get_task
+from lerobot_constructskill.contract import FPS, OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
-from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.lerobot_internals import write_video
+from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
 
@@ -19,7 +21,7 @@ OnStep = Callable[[int, int, np.ndarray, Step], None]
 
 @dataclass
 class Rollout:
-    """What became of one agent: its episodes, or the exception by which it failed."""
+    """Result of one agent: its episodes, or the exception with which it failed."""
 
     episodes: list[Episode] = field(default_factory=list)
     error: Exception | None = None
@@ -78,7 +80,7 @@ def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class _Lanes:
-    """The agents that still run, and what each of them sees."""
+    """The agents that still run, and the last step of each one's environment."""
 
     def __init__(
         self,
@@ -108,8 +110,7 @@ class _Lanes:
                 self.on_step(i, len(episodes) - 1, actions[i], step)
         finished = [i for i, step in self.current.items() if step.done]
         for i in finished:
-            del self.current[i]
-            self.rollouts[i].backend = self.sims.backend(i)
+            self.rollouts[i].backend = self.current.pop(i).backend
         self._start([i for i in finished if len(self.rollouts[i].episodes) < len(self.seeds)])
         return len(finished)
 
@@ -127,3 +128,26 @@ class _Lanes:
             if isinstance(result, Exception):
                 self.rollouts[i] = Rollout(error=result)
         return {i: result for i, result in results.items() if not isinstance(result, Exception)}
+
+
+class FirstEpisode:
+    """The frames of one agent's first episode, seen by the base camera.
+
+    Args:
+        number: which agent is filmed; None for no agent.
+    """
+
+    def __init__(self, number: int | None):
+        self._number = number
+        self._frames: list[np.ndarray] = []
+
+    def add(self, number: int, episode: int, action: np.ndarray, step: Step) -> None:
+        """Keep a frame of the first episode; called as `OnStep`."""
+        if number == self._number and episode == 0:
+            self._frames.append(step.seen["pixels"]["base"])
+
+    def write(self, number: int, path: Path) -> None:
+        """Write the video of an agent, if it is the one that was filmed."""
+        if number == self._number and self._frames:
+            with quiet():
+                write_video(path, self._frames, FPS)

@@ -1,13 +1,15 @@
-"""Errors of a policy's predictions on held-out demonstrations, and the consistency of its chunks.
+"""Errors of a policy's predictions on demonstrations, and the consistency of its chunks.
 
 Every policy is asked the same of every frame, as it was asked in training: a fresh chunk from that frame's
 observation. Action queues and temporal ensembling, which mix chunks of several frames, play no part. Policies that
 sample (diffusion, flow) draw anew for every frame, which their consistency includes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,10 +23,13 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import PolicyAgent, observing
 
+FRAMES, BATCH = 512, 32
+"""Number of frames with pictures on which the held-out error is measured, at most, and how many are read at a time."""
+
 
 @dataclass(frozen=True)
 class Predictions:
-    """One demonstration of T frames through one policy.
+    """What a policy predicts from T frames, of one demonstration for `offline_metrics`.
 
     Args:
         labels: (T, A) what the demonstration did, in metres (radians), translations first, the gripper last.
@@ -132,47 +137,30 @@ def observing_frames(dataset: LeRobotDataset) -> AbstractContextManager[None]:
     return observing(dataset.meta.features, f"'{dataset.repo_id}' has {has}")
 
 
-def predict(
-    policy: PreTrainedPolicy,
-    preprocess: Callable,
-    postprocess: Callable,
-    dataset: LeRobotDataset,
-    episodes: Sequence[int],
-    batch_size: int,
-) -> list[Predictions]:
-    """Ask a policy for a chunk from every frame of some demonstrations.
+def predict(agent: PolicyAgent, dataset: LeRobotDataset, frames: Sequence[int], batch_size: int) -> Predictions:
+    """Ask a policy for a chunk from each of some frames.
 
     Args:
-        policy: any LeRobot policy, in evaluation mode.
-        preprocess: from a batch of the data set to what the policy reads.
-        postprocess: from the policy's output to actions in metres.
-        dataset: the data set, as `observed` opens it for this policy.
-        episodes: which demonstrations.
+        agent: any LeRobot policy between its processors.
+        dataset: the data set, as `open_for` opens it for this policy.
+        frames: indices of the frames.
         batch_size: frames at a time.
     """
-    rows = [dataset.meta.episodes[episode] for episode in episodes]
-    spans = [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
-    predictions = []
-    for span in Progress(spans, policy.name, unit="demo", leave=False):
-        policy.reset()
-        batches = DataLoader(Subset(dataset, span), batch_size)
-        asked = [ask(policy, preprocess, postprocess, batch) for batch in batches]
-        labels, chunks = (torch.cat(parts).float().cpu().numpy() for parts in zip(*asked, strict=True))
-        predictions.append(Predictions(labels, chunks))
-    return predictions
+    agent.policy.reset()
+    asked = [_ask(agent, batch) for batch in DataLoader(Subset(dataset, frames), batch_size)]
+    return Predictions(*(torch.cat(parts).float().cpu().numpy() for parts in zip(*asked, strict=True)))
 
 
 @torch.inference_mode()
-def ask(
-    policy: PreTrainedPolicy, preprocess: Callable, postprocess: Callable, batch: dict
-) -> tuple[torch.Tensor, torch.Tensor]:
+def _ask(agent: PolicyAgent, batch: dict) -> tuple[torch.Tensor, torch.Tensor]:
     """Labels (B, A) of a batch, and the chunks (B, C, A) that a policy predicts; C is 1 for a policy without chunks.
 
     Raises:
         InputError: the policy makes its chunks from a queue of past observations.
     """
+    policy = agent.policy
     seen = {name: value for name, value in batch.items() if name.startswith("observation.")}
-    seen = preprocess(seen | {name: batch[name] for name in ("task", "index")})
+    seen = agent.preprocessor(seen | {name: batch[name] for name in ("task", "index")})
     try:
         chunk = policy.predict_action_chunk(seen)
     except NotImplementedError:
@@ -185,10 +173,16 @@ def ask(
             f"{policy.name} makes its chunks from a queue of past observations, which single frames do not fill: it "
             "can only be rolled out."
         ) from None
-    return batch["action"], postprocess(chunk)
+    return batch[ACTION], agent.postprocessor(chunk)
 
 
-def observed(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
+def spans(dataset: LeRobotDataset, episodes: Sequence[int]) -> list[range]:
+    """Return the indices of the frames of each of some episodes."""
+    rows = [dataset.meta.episodes[episode] for episode in episodes]
+    return [range(row["dataset_from_index"], row["dataset_to_index"]) for row in rows]
+
+
+def open_for(dataset: LeRobotDataset, policy: PreTrainedPolicy) -> LeRobotDataset:
     """Open the data set again with as many observations in a frame as the policy was trained on.
 
     A policy class that reads features in place of images has a method `read_features`, which is called here.
@@ -218,9 +212,8 @@ def policy_errors(
         (n, 3) in metres
     """
     agent.reset(episode)
-    row = dataset.meta.episodes[episode]
     errors = []
-    for index in Progress(range(row["dataset_from_index"], row["dataset_to_index"]), f"episode {episode}"):
+    for index in Progress(*spans(dataset, [episode]), f"episode {episode}"):
         frame = dataset[index]
         batch = {name: value[None] for name, value in frame.items() if name.startswith("observation.")}
         action = agent.decide(agent.preprocessor(batch | {"task": [frame["task"]]}))
@@ -229,3 +222,44 @@ def policy_errors(
             wanted = frame["action"][:3] if labels == "advice" else clean
             errors.append(action[:3] - wanted.numpy())
     return np.array(errors, dtype=np.float64).reshape(-1, 3)
+
+
+def heldout_mse(checkpoint: Path, dataset: LeRobotDataset, episodes: Sequence[int], **acting: Any) -> float | None:
+    """Mean squared translation error of a checkpoint on some demonstrations, in m2 (of one axis); None without any.
+
+    The mean is over all steps of the chunks that the policy predicts from single frames, up to a demonstration's end.
+    A policy without chunks is judged by its first actions. If the frames have pictures, at most `FRAMES` frames are
+    used, evenly spaced. Policies that sample draw from a fixed seed.
+
+    Args:
+        dataset: demonstrations, or the features of demonstrations that the policy was trained on.
+        episodes: numbers of the held-out episodes.
+        acting: fields of the policy's configuration in place of its own, as of `PolicyAgent.from_pretrained`.
+
+    Raises:
+        InputError: the policy acts in other actions, reads what the demonstrations lack, or makes its chunks from a
+            queue of past observations.
+    """
+    ends = {frame: span.stop for span in spans(dataset, episodes) for frame in span}
+    if not ends:
+        return None
+    frames = [*ends]
+    if dataset.meta.camera_keys and len(frames) > FRAMES:
+        frames = [frames[number] for number in np.linspace(0, len(frames) - 1, FRAMES).astype(int)]
+    agent = PolicyAgent.from_pretrained(checkpoint, **acting)
+    check_actions(agent.policy, dataset)
+    on_gpu = [agent.policy.config.device] if agent.policy.config.device.startswith("cuda") else []
+    with observing_frames(dataset), torch.random.fork_rng(on_gpu):
+        torch.manual_seed(0)
+        chunks = predict(agent, open_for(dataset, agent.policy), frames, BATCH).chunks
+    actions = np.asarray(dataset.hf_dataset.with_format("numpy")[ACTION][:], dtype=np.float64)
+    return _mean_square(chunks, actions, frames, [ends[frame] for frame in frames])
+
+
+def _mean_square(chunks: np.ndarray, actions: np.ndarray, frames: Sequence[int], ends: Sequence[int]) -> float:
+    """Mean square of the translation errors of (n, C, A) chunks, each from its frame on, before its end."""
+    axes = len(TRANSLATION)
+    steps = np.asarray(frames)[:, None] + np.arange(chunks.shape[1])
+    valid = steps < np.asarray(ends)[:, None]
+    errors = chunks[valid][:, :axes] - actions[steps[valid]][:, :axes]
+    return float(np.mean(errors**2))

@@ -24,8 +24,6 @@ PRELOADED = [
 ]
 """What every worker imports."""
 
-DIED = "A simulator's process died; if there was not enough memory, run fewer at once."
-
 
 @dataclass(frozen=True)
 class Step:
@@ -37,6 +35,7 @@ class Step:
         done: whether the episode is over.
         info: as of `ConstructSkillEnv.step`.
         agent_state: proprioception, (8,) float32.
+        backend: what simulates and renders, as `ConstructSkillEnv.backend`.
     """
 
     seen: dict[str, Any]
@@ -45,6 +44,7 @@ class Step:
     info: dict[str, Any]
     reward: float = 0.0
     agent_state: np.ndarray | None = None
+    backend: str = ""
 
 
 class Simulators:
@@ -66,10 +66,6 @@ class Simulators:
         """Advance each named environment: number to action."""
         return self._ask(_step, actions)
 
-    def backend(self, number: int) -> str:
-        """What simulates and renders an environment that has been reset."""
-        return self._ask(_backend, {number: None})[number]
-
     def _ask(self, call: Callable[..., Any], arguments: Mapping[int, Any]) -> dict[int, Any]:
         shares = [{} for _ in self._workers]
         for number, argument in arguments.items():
@@ -82,7 +78,9 @@ class Simulators:
             for future in asked:
                 answers |= future.result()
         except BrokenExecutor:
-            raise MachineError(DIED) from None
+            raise MachineError(
+                "A simulator's process died; if there was not enough memory, run fewer at once."
+            ) from None
         return answers
 
 
@@ -120,33 +118,25 @@ def _begin(env_kwargs: Sequence[Mapping[str, Any]]) -> None:
 
 def _answer(call: Callable[..., Any], arguments: Mapping[int, Any]) -> dict[int, Any]:
     """Call a function with each numbered environment and its argument."""
-    return {number: _attempt(_on_environment, call, number, one) for number, one in arguments.items()}
-
-
-def _on_environment(call: Callable[..., Any], number: int, argument: Any) -> Any:
-    if number not in _environments:
-        _environments[number] = ConstructSkillEnv(**_env_kwargs[number])
-    return call(_environments[number], argument)
+    return {number: _attempt(call, number, argument) for number, argument in arguments.items()}
 
 
 def _reset(env: ConstructSkillEnv, seed: int) -> Step:
     seen, info = env.reset(seed=seed)
-    return Step(seen, env.privileged_state(), False, info, 0.0, env.agent_state())
+    return Step(seen, env.privileged_state(), False, info, 0.0, env.agent_state(), env.backend)
 
 
 def _step(env: ConstructSkillEnv, action: np.ndarray) -> Step:
     seen, reward, terminated, truncated, info = env.step(action)
-    return Step(seen, env.privileged_state(), terminated or truncated, info, reward, env.agent_state())
+    return Step(seen, env.privileged_state(), terminated or truncated, info, reward, env.agent_state(), env.backend)
 
 
-def _backend(env: ConstructSkillEnv, _: None) -> str:
-    return env.backend
-
-
-def _attempt(call: Callable[..., Any], *arguments: Any) -> Any:
-    """What a call returns, or what it raises, in a form that can be sent."""
+def _attempt(call: Callable[..., Any], number: int, argument: Any) -> Any:
+    """What a call returns for an environment, which is made first if need be, or what it raises, as can be sent."""
     try:
-        return call(*arguments)
+        if number not in _environments:
+            _environments[number] = ConstructSkillEnv(**_env_kwargs[number])
+        return call(_environments[number], argument)
     except Exception as error:
         told = full_traceback(error)  # an exception leaves it behind when it leaves the process
         try:

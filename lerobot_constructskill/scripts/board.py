@@ -3,22 +3,19 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import RepoId, check
+from lerobot_constructskill.bounds import Checked, RepoId
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
-class BoardConfig:
+class BoardConfig(Checked):
     """Write a page for each suite, board.parquet, and exports for LeRobot, the Hub and vla-evaluation-harness."""
 
     root: Path  # the board's folder, with entries/ and verified/
     out: Path = Path("outputs/board")  # folder to write
     films: bool = False  # also film an episode of each entry's setting that placed and one that did not
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
-
-    def __post_init__(self):
-        check(self)
 
 
 def board(config: BoardConfig) -> str:
@@ -37,7 +34,3 @@ def board(config: BoardConfig) -> str:
 
 def main() -> None:
     run(BoardConfig, board)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from lerobot_constructskill.analysis.section import Level
-from lerobot_constructskill.bounds import Among, Count, Device, Seed, Steps, Text, check
+from lerobot_constructskill.bounds import Among, Checked, Count, Device, Seed, Steps, Text
 from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.scripts.console import run, say
 
 if TYPE_CHECKING:
-    from lerobot_constructskill.comparison.read import Source
-    from lerobot_constructskill.comparison.sides import Side
+    from lerobot_constructskill.comparison.sides import Side, Source
 
 WORSE = "worse"
 FAILED = 3
@@ -21,13 +20,13 @@ FAILED = 3
 
 
 @dataclass
-class CompareConfig:
+class CompareConfig(Checked):
     """Compare two policies by their training seeds: constructskill-compare A B [flags].
 
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
     seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
-    output folders of lerobot-train, which are evaluated where the other side was; output folders of lerobot-eval; or
-    recordings of $CONSTRUCTSKILL_RECORD.
+    output folders of lerobot-train, which are evaluated where the other side was; or recordings of
+    $CONSTRUCTSKILL_RECORD.
 
     Args:
         a: the first side, the candidate.
@@ -37,7 +36,7 @@ class CompareConfig:
         episode_length: the same; the task's own by default.
         perturb: the same; none by default.
         perturb_seed: the same; 0 by default.
-        seed: the --seed that lerobot-eval was given; for two sides of checkpoints, the first start (default 1000).
+        seed: the first start, for two sides of checkpoints; 1000 by default.
         episodes: at most so many starts; for two sides of checkpoints 50 by default.
         fail_if: "worse" ends with status 3 where A is worse than B; else the status is 0 whatever the verdict.
         alpha: level of the tests.
@@ -61,9 +60,6 @@ class CompareConfig:
     together: Count = 10
     device: Device | None = None
 
-    def __post_init__(self):
-        check(self)
-
     @property
     def env(self) -> dict[str, Any]:
         """Keyword arguments of `ConstructSkillEnv` that were given."""
@@ -82,7 +78,7 @@ def compare(config: CompareConfig) -> str:
     """
     from lerobot_constructskill.artifacts.folders import staged
     from lerobot_constructskill.comparison.match import Asked, match
-    from lerobot_constructskill.comparison.read import find
+    from lerobot_constructskill.comparison.sides import find
     from lerobot_constructskill.comparison.tell import as_json, tell
 
     a, b = find(config.a), find(config.b)
@@ -107,7 +103,3 @@ def compare(config: CompareConfig) -> str:
 
 def main() -> None:
     run(CompareConfig, compare, first=("a", "b"))
-
-
-if __name__ == "__main__":
-    main()

@@ -80,7 +80,3 @@ def encode(config: EncodeConfig) -> Path:
 
 def main() -> None:
     run(EncodeConfig, lambda config: f"Feature set written to {encode(config)}")
-
-
-if __name__ == "__main__":
-    main()

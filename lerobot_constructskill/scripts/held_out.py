@@ -109,10 +109,10 @@ def _row(checkpoint: Path, dataset: "LeRobotDataset", episodes: list[int], confi
     agent = PolicyAgent.from_pretrained(checkpoint, config.device, backbone_precision=config.backbone_precision)
     offline.check_actions(agent.policy, dataset)
     torch.manual_seed(config.seed)
-    view = offline.observed(dataset, agent.policy)
-    pipeline = (agent.policy, agent.preprocessor, agent.postprocessor)
+    view = offline.open_for(dataset, agent.policy)
+    bar = Progress(offline.spans(dataset, episodes), agent.policy.name, unit="demo", leave=False)
     with offline.observing_frames(dataset):
-        predictions = offline.predict(*pipeline, view, episodes, config.batch_size)
+        predictions = [offline.predict(agent, view, span, config.batch_size) for span in bar]
     return {
         "policy": agent.policy.name,
         "training_seed": _training_seed(checkpoint),

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import check
+from lerobot_constructskill.bounds import Checked
 from lerobot_constructskill.scripts.console import run
 
 
 @dataclass
-class ReportConfig:
+class ReportConfig(Checked):
     """Write report.html, report.md and figures/ into a study's folder.
 
     The folder holds study.yaml, whose section `analysis` says how the rows are read, and rows.parquet. It may hold
@@ -16,9 +16,6 @@ class ReportConfig:
     """
 
     root: Path  # the study's folder
-
-    def __post_init__(self):
-        check(self)
 
 
 def report(config: ReportConfig) -> Path:
@@ -35,7 +32,3 @@ def report(config: ReportConfig) -> Path:
 
 def main() -> None:
     run(ReportConfig, lambda config: f"Report written to {report(config)}")
-
-
-if __name__ == "__main__":
-    main()

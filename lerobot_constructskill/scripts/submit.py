@@ -75,7 +75,3 @@ def submit(config: SubmitConfig) -> str:
 
 def main() -> None:
     run(SubmitConfig, submit)
-
-
-if __name__ == "__main__":
-    main()

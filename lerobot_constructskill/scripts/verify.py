@@ -68,7 +68,3 @@ def verify(config: VerifyConfig) -> str:
 
 def main() -> None:
     run(VerifyConfig, verify)
-
-
-if __name__ == "__main__":
-    main()

@@ -25,9 +25,8 @@ from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
-from lerobot_constructskill.rollout.lockstep import Rollout, roll_out
+from lerobot_constructskill.rollout.lockstep import FirstEpisode, Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
-from lerobot_constructskill.rollout.video import FirstEpisode
 from lerobot_constructskill.study.rows import EpisodeRow, write_rows
 from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.checkpoints import ACTING, Checkpoints, checkpoint_of

@@ -13,7 +13,7 @@ from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.store import Machine, Node, Store
 from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.files import Json
-from lerobot_constructskill.rollout.heldout import heldout_mse
+from lerobot_constructskill.rollout.offline import heldout_mse
 from lerobot_constructskill.training.checkpoints import Checkpoints, checkpoint_of
 
 FILE = "heldout.json"
@@ -44,7 +44,7 @@ class HeldOutError(Node):
         return {"checkpoint": self.checkpoints, "data": data}
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
-        """Measure the error. Raises as `rollout.heldout.heldout_mse` does."""
+        """Measure the error. Raises as `rollout.offline.heldout_mse` does."""
         dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
         episodes = held_out(dataset.num_episodes, self.checkpoints.training.holdout)
         checkpoint = checkpoint_of(self.seed, inputs["checkpoint"])

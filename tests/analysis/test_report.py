@@ -136,7 +136,7 @@ def test_a_run_that_was_not_made_is_neither_a_failure_nor_a_zero(tmp_path):
     assert (findings.planned, findings.missing) == (4, 1)
     assert (two.seeds, len(two.failures), len(two.runs)) == (2, 0, 1)
     assert two.success["placed"].counts == (1, 1) and two.success["placed"].mean.value == 1
-    assert [(pair.counts_a, pair.counts_b) for pair in setting.count_comparisons["placed"]] == [((2, 2), (1, 1))]
+    assert [(pair.counts_a, pair.counts_b) for pair in setting.comparisons["placed"]] == [((2, 2), (1, 1))]
     assert findings.failures == []
 
 
@@ -216,7 +216,7 @@ def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_f
 def test_declared_comparisons_are_the_family(tmp_path):
     findings = findings_of(STUDY, study_rows(), tmp_path, comparisons=[["clip", "dinov2"], ["augreg", "dinov2"]])
     fixed, moved = findings.settings
-    assert [(pair.a, pair.b) for pair in fixed.count_comparisons["placed"]] == [
+    assert [(pair.a, pair.b) for pair in fixed.comparisons["placed"]] == [
         ("clip", "dinov2"),
         ("augreg", "dinov2"),
     ]
@@ -320,7 +320,7 @@ def test_studies_at_the_ends(met, tmp_path):
     """All or none of the seeds succeed, no run has a held-out error, and nothing can be told apart."""
     rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, met, met)]
     (setting,) = findings_of(SMALL, rows, tmp_path).settings
-    assert [pair.conclusion for pair in setting.count_comparisons["placed"]] == [Conclusion.INCONCLUSIVE]
+    assert [pair.conclusion for pair in setting.comparisons["placed"]] == [Conclusion.INCONCLUSIVE]
     assert setting.correlations[0][1]["placed"] is None
     report(ReportConfig(tmp_path))
     assert not list((tmp_path / "figures").glob("*_error.*"))
@@ -334,7 +334,7 @@ def test_a_variant_that_could_not_run_is_never_a_zero(kind, error, tmp_path, no_
     one, two = findings.settings[0].variants
     assert one.success["placed"].counts.met == 1
     assert not two.success and two.absence == "no run finished"
-    assert findings.settings[0].count_comparisons["placed"] == []
+    assert findings.settings[0].comparisons["placed"] == []
     report(ReportConfig(tmp_path))
     markdown = (tmp_path / "report.md").read_text()
     assert "| two | no run finished |" in markdown

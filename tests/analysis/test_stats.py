@@ -11,22 +11,22 @@ from scipy.stats import binom, bootstrap, kendalltau
 from lerobot_constructskill.analysis.stats.comparisons import (
     Conclusion,
     boschloo,
-    compare_counts,
+    compare,
     fisher,
     holm,
+    mean_p_value,
     probability_better,
+    spread_p_value,
 )
 from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
-from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, newcombe
+from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, mean_rate, newcombe
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
 from lerobot_constructskill.analysis.stats.power import (
     _rejected,
-    detectable_difference,
     power,
     seeds_needed,
     wrong_order,
 )
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, mean_rate, spread_p_value
 from lerobot_constructskill.study.rows import NOT_RUN
 
 # Paper, Tables I and II: seeds that lifted, seeds that placed, seeds.
@@ -38,6 +38,11 @@ PAIRS = list(combinations(BACKBONES, 2))
 
 # Where shares and numbers of seeds are at their ends, and between.
 ARMS = [Counts(met, seeds) for seeds in (1, 3, 10) for met in {0, 1, seeds // 2, seeds}]
+
+
+def shares(counts: Counts) -> np.ndarray:
+    """Seeds of which so many succeed always, and the others never."""
+    return np.repeat([1.0, 0.0], [counts.met, counts.seeds - counts.met])
 
 
 @pytest.fixture
@@ -57,7 +62,9 @@ def test_fisher_gives_the_papers_four_p_values(counts, other, p_value, digits):
 def test_what_the_paper_does_not_say():
     """Spec, section 5, last paragraph."""
     assert round(fisher(BASELINE, NOISE_FREE), 2) == 0.10
-    comparison = compare_counts(LIFTED, PAIRS)[PAIRS.index(("dinov2", "clip"))]
+    comparison = compare({name: shares(counts) for name, counts in LIFTED.items()}, PAIRS)[
+        PAIRS.index(("dinov2", "clip"))
+    ]
     assert round(comparison.boschloo, 3) == 0.042
     assert round(comparison.holm, 2) == 0.17
     assert comparison.conclusion is Conclusion.INCONCLUSIVE
@@ -125,10 +132,20 @@ def test_holm_only_raises_and_counts_what_was_not_made():
 def test_conclusions():
     counts = {"all": Counts(30, 30), "every": Counts(30, 30), "half": Counts(15, 30), "three": Counts(3, 3)}
     pairs = [("all", "half"), ("half", "all"), ("all", "every"), ("half", "three"), ("all", "absent")]
-    comparisons = compare_counts(counts, pairs)
+    comparisons = compare({name: shares(own) for name, own in counts.items()}, pairs)
     conclusions = [Conclusion.BETTER, Conclusion.WORSE, Conclusion.ALIKE, Conclusion.INCONCLUSIVE]
     assert [comparison.conclusion for comparison in comparisons] == conclusions
     assert comparisons[0].holm == pytest.approx(5 * comparisons[0].boschloo)
+
+
+@pytest.mark.slow
+def test_as_many_seeds_as_needed_have_the_power():
+    needed = seeds_needed(1.0, 0.5)
+    assert seeds_needed(0.5, 1.0) == needed > seeds_needed(1.0, 0.2)
+    assert power(1.0, 0.5, needed) >= 0.8 > power(1.0, 0.5, needed - 1)
+    assert seeds_needed(0.3, 0.3) is None and seeds_needed(0.93, 0.9) == np.inf
+    over_rates = [seeds_needed(1.0, rate / 30) for rate in range(30)]
+    assert over_rates == sorted(over_rates) and over_rates[0] >= 2
 
 
 def test_power_grows_with_seeds_and_difference():
@@ -136,20 +153,6 @@ def test_power_grows_with_seeds_and_difference():
     over_seeds = [power(0.9, 0.4, seeds) for seeds in (3, 10, 20, 30)]
     over_rates = [power(0.9, rate, 20) for rate in (0.8, 0.6, 0.4, 0.2)]
     assert over_seeds == sorted(over_seeds) and over_rates == sorted(over_rates)
-
-
-@pytest.mark.slow
-def test_what_can_be_detected_is_detected():
-    assert detectable_difference(1.0, 3) is None
-    drops = [detectable_difference(1.0, seeds) for seeds in (10, 20, 40)]
-    assert drops == sorted(drops, reverse=True)
-    assert power(1.0, 1.0 - drops[0], 10) == pytest.approx(0.8, abs=1e-3)
-    needed = seeds_needed(1.0, 0.5)
-    assert seeds_needed(0.5, 1.0) == needed > seeds_needed(1.0, 0.2)
-    assert power(1.0, 0.5, needed) >= 0.8 > power(1.0, 0.5, needed - 1)
-    assert seeds_needed(0.3, 0.3) is None and seeds_needed(0.93, 0.9) == np.inf
-    over_rates = [seeds_needed(1.0, rate / 30) for rate in range(30)]
-    assert over_rates == sorted(over_rates) and over_rates[0] >= 2
 
 
 @pytest.mark.parametrize("seeds", [1, 4, 13])
@@ -298,8 +301,8 @@ def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_ru
     kinds = {"lifted": "boolean", "placed": "boolean", "error_kind": "string", "error": "string"}
     table = pd.DataFrame(rows).astype(kinds)
     runs = runs_of(table)
-    assert count(runs, "lifted") == count(runs, "placed") == Counts(1, 2)
+    assert count(runs["lifted_rate"]) == count(runs["placed_rate"]) == Counts(1, 2)
     assert runs["placed_rate"].tolist() == [0.5, 0.0] and runs["episodes"].tolist() == [2, 0]
     assert runs["error_kind"].isna().tolist() == [True, False]
-    assert count(runs_of(table[table["training_seed"] == 1]), "lifted") == Counts(0, 1)
+    assert count(runs_of(table[table["training_seed"] == 1])["lifted_rate"]) == Counts(0, 1)
     assert runs_of(table[table["training_seed"] == 2]).empty

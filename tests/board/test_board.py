@@ -77,10 +77,10 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
     assert entries and pages.keys() == {"index", *BOARD_SUITES}
     for entry in entries:
         assert entry.level == "replayed"
-        assert entry.name in pages[entry.said.suite].found["id"]
+        assert entry.name in pages[entry.declaration.suite].found["id"]
         path = tmp_path / "exports" / entry.name / ".eval_results/constructskill.yaml"
-        official = entry.said.settings_class == "standard" and not entry.is_reference
-        tasks = [f"{entry.said.suite}_{one}" for one in entry.standings] if official else []
+        official = entry.declaration.settings_class == "standard" and not entry.is_reference
+        tasks = [f"{entry.declaration.suite}_{one}" for one in entry.standings] if official else []
         results = yaml.safe_load(path.read_text()) if path.exists() else []
         assert [one["dataset"]["task_id"] for one in results] == tasks
         assert all(list(one) == ["dataset", "value", "notes"] for one in results), "in the order of the Hub's page"
@@ -104,20 +104,21 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     bad, few = (next(entry for entry in entries if entry.name == name) for name in ("bad", "few"))
     assert bad.standings["block_to_bin"].errors == 1 and bad.standings["block_to_bin"].placed.value == 0
     assert few.missing_seeds == 8 and not few.is_ranked
-    unseen = replace(good.submission, declaration=replace(good.said, backend="physx_cuda, gpu rendering"))
+    unseen = replace(good.submission, declaration=replace(good.declaration, backend="physx_cuda, gpu rendering"))
     assert not replace(good, submission=unseen).is_ranked, "nobody can replay it"
     twin = replace(good, name="twin")
     assert ranks([good, twin], "block_to_bin") == {"good": (1, True), "twin": (1, True)}
-    easier = replace(good.said, settings={"block_to_bin": replace(good.said.settings["block_to_bin"], episodes=1)})
+    setting = replace(good.declaration.settings["block_to_bin"], episodes=1)
+    easier = replace(good.declaration, settings={"block_to_bin": setting})
     other = replace(good, name="other", submission=replace(good.submission, declaration=easier))
     assert ranks([bad, other], "block_to_bin") == {"bad": (1, False), "other": (1, False)}, "from other starts"
 
 
 def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
-    entries = [
-        replace(entry, level=level) for entry in read_entries(BOARD).entries for level in ("claimed", "replayed")
-    ]
-    standard = {entry.name for entry in entries if entry.said.settings_class == "standard" and not entry.is_reference}
+    entries = [replace(entry, level=level) for entry in read_entries(BOARD)[0] for level in ("claimed", "replayed")]
+    standard = {
+        entry.name for entry in entries if entry.declaration.settings_class == "standard" and not entry.is_reference
+    }
     write_exports(entries[1::2], tmp_path, "today", "alice/bench")
     assert {path.parts[-3] for path in tmp_path.glob("exports/*/.eval_results/*")} == standard != set()
     write_exports(entries[::2], tmp_path, "today", "alice/bench")
@@ -140,9 +141,7 @@ def test_of_an_entry_that_was_withdrawn_no_export_stays_and_what_is_somebody_els
 def test_an_entry_that_is_being_written_is_not_read(many, tmp_path):
     board = shutil.copytree(many, tmp_path / "board")
     (board / "entries" / "new.partial").mkdir()
-    assert [entry.name for entry in read_entries(board).entries] == [
-        entry.name for entry in read_entries(many).entries
-    ]
+    assert [entry.name for entry in read_entries(board)[0]] == [entry.name for entry in read_entries(many)[0]]
 
 
 def test_of_two_verdicts_at_once_none_is_lost(tmp_path, monkeypatch):
@@ -176,7 +175,7 @@ def test_what_a_stranger_writes_is_text(many, tmp_path):
 def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     root = tmp_path / "board"
     shutil.copytree(many, root)
-    entry = read_entries(root).entries[0]
+    entry = read_entries(root)[0][0]
     (root / "verified").mkdir()
     path = root / "verified" / f"{entry.name}.json"
     verdict = {
@@ -187,14 +186,14 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     }
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
-        assert read_entries(root).entries[0].level == level
+        assert read_entries(root)[0][0].level == level
     path.write_text('{"level": "best"}')
-    assert "is not a verdict of constructskill-verify: submission: it is missing" in read_entries(root).refused[0]
+    assert "is not a verdict of constructskill-verify: submission: it is missing" in read_entries(root)[1][0]
     path.unlink()
     declaration = root / "entries" / entry.name / "submission.yaml"
     declaration.write_text(declaration.read_text().replace("version: 1", "version: 7"))
     (root / "entries" / "No Name").mkdir()
-    no_name, version = read_entries(root).refused
+    _, (no_name, version) = read_entries(root)
     assert "Entry 'No Name': the folder of an entry must be called by a name" in no_name
     assert version.startswith(f"Entry '{entry.name}': ") and "version" in version
     with pytest.raises(MissingError, match="is not a board"):
@@ -262,7 +261,7 @@ def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypa
 
 
 def test_rewards_are_those_of_the_environment():
-    expert = next(entry for entry in read_entries(BOARD).entries if entry.name == "bins_expert")
+    expert = next(entry for entry in read_entries(BOARD)[0] if entry.name == "bins_expert")
     info = eval_info(expert, 0)
     assert info["overall"]["n_episodes"] == 101 and info["overall"]["pc_success"] == 100
     (fixed,) = expert.standings["brick_to_bin"].claims[0]
@@ -272,6 +271,6 @@ def test_rewards_are_those_of_the_environment():
 
 
 def test_an_episode_that_failed_with_an_error_has_no_reward(many):
-    bad = next(entry for entry in read_entries(many).entries if entry.name == "bad")
+    bad = next(entry for entry in read_entries(many)[0] if entry.name == "bad")
     (task,) = eval_info(bad, 0)["per_task"]
     assert task["metrics"]["max_rewards"][0] == task["metrics"]["sum_rewards"][0] == 0

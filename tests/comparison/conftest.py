@@ -1,4 +1,4 @@
-"""Sides of comparisons on disk: a study's folder, results of lerobot-eval, recordings and checkpoints."""
+"""Sides of comparisons on disk: a study's folder, recordings and checkpoints."""
 
 import json
 from collections.abc import Sequence
@@ -39,22 +39,6 @@ def study(tmp_path):
         write_rows(rows, folder / "rows.parquet")
         (folder / "study.yaml").write_text(yaml.safe_dump({"settings": {"block": {"env": env}}}))
         return f"{folder}:block/ours"
-
-    return write
-
-
-@pytest.fixture
-def evaluated(tmp_path):
-    """Write folders as `lerobot-eval` leaves them; return a pattern of them."""
-
-    def write(placed: Sequence[int], name: str = "eval", group: str = "constructskill", number: int = 0) -> str:
-        for seed, count in enumerate(placed):
-            metrics = {"successes": [i < count for i in range(len(STARTS))], "max_rewards": [0.0] * len(STARTS)}
-            folder = tmp_path / name / f"seed_{seed}"
-            folder.mkdir(parents=True)
-            told = {"per_task": [{"task_group": group, "task_id": number, "metrics": metrics}]}
-            (folder / "eval_info.json").write_text(json.dumps(told))
-        return str(tmp_path / name / "seed_*")
 
     return write
 

@@ -1,15 +1,13 @@
 """Two sides are brought together by where and from which starts they were evaluated, and judged over seeds."""
 
 import json
-import re
 from pathlib import Path
 
 import pytest
 
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.comparison.match import Asked, MatchedSides, match
-from lerobot_constructskill.comparison.read import find, read_study
-from lerobot_constructskill.comparison.sides import Side, conditions
+from lerobot_constructskill.comparison.sides import Side, conditions, find, read_study
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.recording import Episode
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
@@ -30,15 +28,14 @@ def compared(a: str, b: str, evaluate=no_evaluation, **asked) -> MatchedSides:
     return match(find(a), find(b), Asked(**asked), evaluate, 0.05)
 
 
-def test_a_study_is_compared_with_recordings_and_results_of_lerobot_eval(study, recorded, evaluated):
+def test_a_study_is_compared_with_recordings(study, recorded):
     published = study(BAD)
-    many, one = recorded(GOOD), recorded(GOOD, "one", whole=True)
-    for other, asked in ((many, {}), (one, {}), (evaluated(GOOD), {"seed": 1000})):
-        comparison = compared(other, published, **asked)
+    for other in (recorded(GOOD), recorded(GOOD, "one", whole=True)):
+        comparison = compared(other, published)
         assert comparison.judgement.conclusion is Conclusion.BETTER and comparison.starts == list(range(1000, 1010))
         assert comparison.rates_a == [count / 10 for count in GOOD]
         assert comparison.rates_b == [count / 10 for count in BAD]
-        assert compared(published, other, **asked).judgement.conclusion is Conclusion.WORSE
+        assert compared(published, other).judgement.conclusion is Conclusion.WORSE
 
 
 def test_every_published_study_has_a_variant_that_can_be_compared_with():
@@ -98,7 +95,7 @@ def test_checkpoints_are_evaluated_where_the_other_side_was(study, checkpoints):
 
     def evaluate(found, env, starts):
         seen.append((len(found.folders), env, list(starts)))
-        return Side(found.name, "checkpoints", env, [dict.fromkeys(starts, True)] * len(found.folders))
+        return Side(found.name, "checkpoints", env, [dict.fromkeys(starts, True)] * len(found.folders), {})
 
     env = {"task": "block_to_bin", "episode_length": 7, "light_robot": False}
     assert compared(checkpoints(2), study(BAD, env=env), evaluate, episodes=4).judgement.mean_a.value == 1
@@ -108,18 +105,6 @@ def test_checkpoints_are_evaluated_where_the_other_side_was(study, checkpoints):
     seen.clear()
     compared(str(checkpoints(2, "a")), checkpoints(3, "b", ""), evaluate, env={"task": "block_to_bin"}, seed=7)
     assert seen == [(n, {"task": "block_to_bin"}, list(range(7, 57))) for n in (2, 3)]
-
-
-def test_of_lerobot_eval_the_start_has_to_be_said_and_the_rest_is_the_other_sides(study, evaluated):
-    published = study(GOOD)
-    with pytest.raises(InputError, match="does not write from which starts it evaluated: add --seed"):
-        compared(evaluated(GOOD), published)
-    assert compared(evaluated(GOOD, "bins", "bins", 2), published, seed=1000).starts
-    for group, number in (("bins", 1), ("constructskill+camera=1+seed=0", 0), ("pusht", 0)):
-        with pytest.raises(InputError, match=re.escape(f"of block_to_bin for certain; it has: {group} {number}")):
-            compared(evaluated(GOOD, f"of_{group}", group, number), published, seed=1000)
-    with pytest.raises(InputError, match="leave out --seed"):
-        compared(published, study(GOOD, "two"), seed=1000)
 
 
 def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
@@ -135,6 +120,8 @@ def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
     for text, said in refusals.items():
         with pytest.raises((InputError, MissingError), match=said):
             compared(text, published)
+    with pytest.raises(InputError, match="leave out --seed"):
+        compared(published, study(GOOD, "two"), seed=1000)
     with pytest.raises(InputError, match="is on both sides"):
         compared(published, published)
     with pytest.raises(InputError, match="Every training seed of '.*' failed, so there is nothing"):
@@ -145,13 +132,8 @@ def test_what_is_no_side_is_refused(study, recorded, checkpoints, tmp_path):
         compare(CompareConfig(published, study(BAD, "b"), out=tmp_path))
 
 
-def test_damaged_files_are_one_sentence(study, evaluated, recorded, tmp_path):
+def test_damaged_files_are_one_sentence(study, recorded, tmp_path):
     published = study(GOOD)
-    for damaged in ("{}", "[", '{"per_task": [{"task_group": "constructskill", "task_id": 0, "metrics": {}}]}'):
-        pattern = evaluated(GOOD[:1], f"eval_{len(damaged)}")
-        next(tmp_path.glob(f"eval_{len(damaged)}/*/*.json")).write_text(damaged)
-        with pytest.raises(InputError, match="is not what lerobot-eval writes"):
-            compared(pattern, published, seed=1000)
     pattern = recorded(GOOD[:1])
     Episode(1000, **ENV).write(next(tmp_path.glob("recorded/*")))
     with pytest.raises(InputError, match="has two recordings of start 1000"):
@@ -164,7 +146,7 @@ def test_damaged_files_are_one_sentence(study, evaluated, recorded, tmp_path):
         compared(published, study(BAD, "b"))
 
 
-def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, recorded, evaluated):
+def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, recorded):
     told = compare(CompareConfig(study(GOOD, "torch_1"), study(BAD, "torch_2")))
     assert "A is better than B." in told and "5 of 5" in told
     assert "They differ in torch (torch_1 and torch_2)." in told
@@ -174,10 +156,8 @@ def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, 
     assert "This number of seeds does not show which of them is better." in one
     assert "torch (" in one.partition("They differ in ")[2]
     assert "lerobot (unknown and 0.6.1); processor (unknown and a CPU)" in one
-    few = compare(CompareConfig(evaluated(GOOD[:3]), study(BAD[:3], "few"), seed=1000))
+    few = compare(CompareConfig(recorded(GOOD[:3], "three"), study(BAD[:3], "few")))
     assert "3 seeds against 3 can show no difference, however large: their p-value is at least 0.1." in few
-    assert "does not write where it evaluated: A is taken to be from there" in few
-    assert "They differ in lerobot (unknown and 0.6.1)" in few
 
 
 def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys, monkeypatch, tmp_path):

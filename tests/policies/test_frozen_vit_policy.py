@@ -1,6 +1,5 @@
 """What the policy computes: bounds, loss, ensembling, thresholds, and what stays frozen."""
 
-import logging
 import math
 
 import pytest
@@ -155,24 +154,6 @@ def test_without_ensembling_a_chunk_is_followed(n_action_steps, make_policy, mon
     torch.testing.assert_close(taken[:, :3], expected[:, :3])
 
 
-def test_the_heldout_error_is_logged_when_training_goes_on(make_policy, make_batch, caplog):
-    policy = make_policy(action_names=["dx", "dy", "dz", "dyaw", "gripper"])
-    heldout = [make_batch(policy, 4, seed=1), make_batch(policy, 3, seed=2)]
-    caplog.set_level(logging.INFO)
-    policy.eval()
-    for batch in heldout:
-        policy.forward(batch)
-    policy.train()
-    policy.train()  # as LeRobot's loop does: after the evaluation, and again before the step
-    policy.forward(make_batch(policy))
-    (reported,) = [said for said in caplog.messages if said.startswith("heldout_translation_mse_m2=")]
-    errors = []
-    for batch in heldout:
-        difference = policy.predict_action_chunk(batch) - batch["action"]
-        errors.append(difference[~batch["action_is_pad"]][:, :3].pow(2).flatten())
-    assert float(reported.partition("=")[2]) == pytest.approx(torch.cat(errors).mean().item(), rel=1e-4)
-
-
 @pytest.mark.parametrize("logit", [-30.0, 0.5, 30.0])
 def test_a_translation_is_a_tenth_of_a_metre_times_tanh(make_policy, images, logit):
     """Paper, section II."""
@@ -257,8 +238,6 @@ def test_heat_maps_learn_where_things_are_and_nothing_acts_on_where_they_are_sai
     assert (last := policy.forward(batch)[1]["point_loss"]) < 0.7 * first, (first, last)
     untold = {name: value for name, value in batch.items() if "points" not in name}
     torch.testing.assert_close(policy.predict_action_chunk(untold), policy.predict_action_chunk(batch))
-    with pytest.raises(InputError, match="--patches=true --points=true"):
-        policy.forward(untold)
 
 
 def test_the_weight_of_the_points_is_the_configured_one(make_policy, make_batch):

@@ -11,7 +11,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.heldout import heldout_mse
+from lerobot_constructskill.rollout.offline import heldout_mse
 
 EPOCHS, BATCH_SIZE = 3, 16
 HELD_OUT = [3, 7]

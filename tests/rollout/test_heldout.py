@@ -1,11 +1,11 @@
-"""The held-out error of any policy is that which frozen_vit tells of its own."""
+"""The held-out error of any policy, on frames that are the same each time."""
 
 import numpy as np
 import pytest
 import torch
 
 from lerobot_constructskill.policies.frozen_vit import train_seeds
-from lerobot_constructskill.rollout import heldout
+from lerobot_constructskill.rollout import offline
 from lerobot_constructskill.rollout.agents import PolicyAgent
 
 EPISODES = [3, 7]
@@ -23,21 +23,21 @@ def trained(request, config, feature_set, tmp_path_factory):
 
 def test_it_is_of_what_is_held_out_alone(trained, feature_set):
     _, folder = trained
-    apart = [heldout.heldout_mse(folder, feature_set, [episode]) for episode in EPISODES]
-    assert min(apart) <= heldout.heldout_mse(folder, feature_set, EPISODES) <= max(apart)
-    assert heldout.heldout_mse(folder, feature_set, []) is None
+    apart = [offline.heldout_mse(folder, feature_set, [episode]) for episode in EPISODES]
+    assert min(apart) <= offline.heldout_mse(folder, feature_set, EPISODES) <= max(apart)
+    assert offline.heldout_mse(folder, feature_set, []) is None
 
 
 def test_of_many_pictures_a_few_are_looked_at_that_lie_in_all_episodes(trained, feature_set, monkeypatch):
     """The features stand in for pictures, of which all would take long to encode."""
     _, folder = trained
     monkeypatch.setattr(type(feature_set.meta), "camera_keys", ["observation.images.base"])
-    whole = heldout.heldout_mse(folder, feature_set, EPISODES)
+    whole = offline.heldout_mse(folder, feature_set, EPISODES)
     asked = []
-    real = heldout._mean_square
-    monkeypatch.setattr(heldout, "FRAMES", 8)
-    monkeypatch.setattr(heldout, "_mean_square", lambda *given: asked.extend(given[2]) or real(*given))
-    assert heldout.heldout_mse(folder, feature_set, EPISODES) == pytest.approx(whole, rel=0.5)
+    real = offline._mean_square
+    monkeypatch.setattr(offline, "FRAMES", 8)
+    monkeypatch.setattr(offline, "_mean_square", lambda *given: asked.extend(given[2]) or real(*given))
+    assert offline.heldout_mse(folder, feature_set, EPISODES) == pytest.approx(whole, rel=0.5)
     numbers = np.asarray(feature_set.hf_dataset.with_format("numpy")["episode_index"][:])
     assert len(asked) == 8 and set(numbers[asked]) == set(EPISODES) and np.diff(asked).min() > 0
 
@@ -53,5 +53,5 @@ def test_what_a_policy_samples_is_drawn_alike_each_time(trained, feature_set, mo
         return agent
 
     monkeypatch.setattr(PolicyAgent, "from_pretrained", sampling)
-    first, second = (heldout.heldout_mse(folder, feature_set, EPISODES) for _ in range(2))
+    first, second = (offline.heldout_mse(folder, feature_set, EPISODES) for _ in range(2))
     assert first == second

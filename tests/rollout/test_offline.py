@@ -17,15 +17,16 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.lerobot_internals import TRAIN_CONFIG
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.agents import PolicyAgent
-from lerobot_constructskill.rollout.heldout import heldout_mse
 from lerobot_constructskill.rollout.offline import (
     Predictions,
     check_actions,
-    observed,
+    heldout_mse,
     observing_frames,
     offline_metrics,
+    open_for,
     policy_errors,
     predict,
+    spans,
 )
 from lerobot_constructskill.scripts.held_out import OfflineConfig, evaluate_offline
 from lerobot_constructskill.training.recipe import FACTS, Training
@@ -67,7 +68,8 @@ def as_it_is(batch):
 
 
 def measure(policy, dataset):
-    return offline_metrics(predict(policy, as_it_is, as_it_is, dataset, EPISODES, batch_size=7))
+    agent = SimpleNamespace(policy=policy, preprocessor=as_it_is, postprocessor=as_it_is)
+    return offline_metrics([predict(agent, dataset, span, 7) for span in spans(dataset, EPISODES)])
 
 
 def test_a_policy_that_repeats_the_labels_has_no_error(feature_set):
@@ -88,7 +90,7 @@ def test_a_constant_shift_is_found_in_metres(feature_set):
 
 def test_a_policy_of_two_observations_is_shown_two_and_the_labels_of_one(feature_set):
     asks = SimpleNamespace(observation_delta_indices=[-1, 0], action_delta_indices=[0, 1], reward_delta_indices=None)
-    view = observed(feature_set, SimpleNamespace(config=asks))
+    view = open_for(feature_set, SimpleNamespace(config=asks))
     both = torch.stack([feature_set[frame]["observation.state"] for frame in (4, 5)])
     assert torch.equal(view[5]["observation.state"], both) and view[5]["action"].shape == (4,)
 
@@ -147,7 +149,7 @@ def said(seed: int, holdout: int) -> dict:
 
 
 def test_checkpoints_become_rows_that_say_what_they_were_asked(config, feature_set, tmp_path):
-    """Of chunks of one step the error is that which training found on the same held-out episodes."""
+    """For chunks of one step the error is the one that a study measures on the same held-out episodes."""
     trained = train_seeds(config(chunk_size=1), feature_set, [0, 1], epochs=3, batch_size=16, held_out=EPISODES)
     for policy, seed in zip(trained, [0, 1], strict=True):
         save_checkpoint(policy, feature_set, tmp_path / f"checkpoint_{seed}")

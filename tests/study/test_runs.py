@@ -815,8 +815,7 @@ EDITS = {
     "features/encode.py": ("policy", "import numpy as np\n", "import numpy as np\n\nBATCHES = 2\n"),
     "rollout/lockstep.py": ("episodes", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
     "study/runs.py": ("runs", "FILMED_SEED = 0", "FILMED_SEED = 1"),
-    "dagger/driving.py": ("nothing", "from dataclasses import", "TIMES = 0.9
-from dataclasses import"),
+    "dagger/driving.py": ("nothing", "from dataclasses import", "TIMES = 0.9\nfrom dataclasses import"),
     "study/table.py": ("nothing", "class Table", "class Rows"),
     "analysis/report/formats.py": ("nothing", '"""', '"""Said otherwise. '),
 }

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from lerobot_constructskill.analysis.stats.comparisons import CountComparison, RateComparison
+from lerobot_constructskill.analysis.stats.comparisons import Comparison
 from lerobot_constructskill.analysis.stats.correlation import Correlation
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.outcomes import Counts
@@ -92,8 +92,7 @@ class SettingFindings:
         data_sets: names of data sets with a known held-out error, the setting's own first.
         groups: variants by number of seeds, most seeds first.
         declared: number of declared comparisons.
-        count_comparisons: criterion to the declared comparisons of seed counts that could be made.
-        rate_comparisons: criterion to the same comparisons of shares of episodes.
+        comparisons: criterion to the declared comparisons that could be made.
         correlations: (label, criterion to Kendall's tau of held-out error and episodes), all variants together first.
     """
 
@@ -104,8 +103,7 @@ class SettingFindings:
     data_sets: list[str]
     groups: list[SeedGroup]
     declared: int
-    count_comparisons: dict[str, list[CountComparison]]
-    rate_comparisons: dict[str, list[RateComparison]]
+    comparisons: dict[str, list[Comparison]]
     correlations: list[tuple[str, dict[str, Correlation | None]]]
 
     @property

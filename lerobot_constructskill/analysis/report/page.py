@@ -65,7 +65,7 @@ def write_report(root: Path) -> Path:
         "study": read_text(root / STUDY),
         "findings": findings,
         "films": partial(films, root, rows),
-        "facts": [*provenance(rows), *extra_facts(root / PROVENANCE)],
+        "facts": provenance(root, rows),
         "version": metadata.version("lerobot_env_constructskill"),
     }
     for form, finalize in {"md": _escape_markdown, "html": None}.items():
@@ -98,25 +98,21 @@ def films(root: Path, rows: pd.DataFrame, setting: SettingFindings) -> list[tupl
     return [(f"{label}, {_outcome(row)}", Markup(quote(row["video"]))) for label, row in shown]
 
 
-def provenance(rows: pd.DataFrame) -> list[tuple[str, str]]:
-    """(name, value) of the hashes, back ends and versions of all rows, versions last."""
+def provenance(root: Path, rows: pd.DataFrame) -> list[tuple[str, str]]:
+    """(name, value) of the hashes, back ends and versions of all rows, then of the entries of any provenance.json.
+
+    Raises:
+        InputError: that file is not a JSON object.
+    """
     facts = []
     for column, title in COLUMNS.items():
         if len(values := sorted(rows[column].dropna().unique())):
             many = f"{len(values)} different, as in rows.parquet"
             facts.append((title, ", ".join(values) if len(values) <= SHOWN else many))
     versions = pd.DataFrame([json.loads(text) for text in rows["versions"].dropna().unique()])
-    return facts + [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
-
-
-def extra_facts(path: Path) -> list[tuple[str, str]]:
-    """(name, value) of the entries of an optional provenance.json.
-
-    Raises:
-        InputError: the file is not a JSON object.
-    """
-    facts = KNOWN.read(path) if path.exists() else {}
-    return [(name.replace("_", " "), str(value)) for name, value in facts.items()]
+    facts += [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
+    others = KNOWN.read(root / PROVENANCE) if (root / PROVENANCE).exists() else {}
+    return facts + [(name.replace("_", " "), str(value)) for name, value in others.items()]
 
 
 def _is_inside(root: Path, video: str) -> bool:

@@ -15,11 +15,10 @@ from lerobot_constructskill.analysis.report.findings import (
     VariantFindings,
 )
 from lerobot_constructskill.analysis.section import Analysis
-from lerobot_constructskill.analysis.stats.comparisons import compare_counts, compare_rates
+from lerobot_constructskill.analysis.stats.comparisons import compare
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
-from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson
+from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, count, runs_of
-from lerobot_constructskill.analysis.stats.spread import mean_rate
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT
 
@@ -91,11 +90,10 @@ def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.Data
         pairs = [(a.name, b.name) for a, b in combinations(variants, 2) if a.seeds == b.seeds]
     pairs = [(a, b) for a, b in pairs if {a, b} <= {one.name for one in variants}]
     made = [one for one in variants if one.success]
-    counts, rates = {}, {}
-    for criterion in CRITERIA:
-        of = {one.name: one.success[criterion].counts for one in made}
-        counts[criterion] = compare_counts(of, pairs, analysis.alpha)
-        rates[criterion] = compare_rates({one.name: _rates(one.runs, criterion) for one in made}, pairs)
+    comparisons = {
+        criterion: compare({one.name: _rates(one.runs, criterion) for one in made}, pairs, analysis.alpha)
+        for criterion in CRITERIA
+    }
     return SettingFindings(
         name=name,
         label=analysis.label(name),
@@ -104,8 +102,7 @@ def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.Data
         data_sets=_data_sets(runs),
         groups=_groups(ordered, planned),
         declared=len(pairs),
-        count_comparisons=counts,
-        rate_comparisons=rates,
+        comparisons=comparisons,
         correlations=_correlations(variants, ordered),
     )
 
@@ -138,7 +135,8 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
 
 
 def _success(runs: pd.DataFrame, criterion: str) -> Success:
-    counts, rates = count(runs, criterion), _rates(runs, criterion)
+    rates = _rates(runs, criterion)
+    counts = count(rates)
     return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
 
 

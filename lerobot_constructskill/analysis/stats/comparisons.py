@@ -1,20 +1,22 @@
 """Comparisons of two variants on one criterion: exact tests of seed counts, permutation tests of shares."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.stats import beta, boschloo_exact, fisher_exact
+from scipy.stats import beta, boschloo_exact, fisher_exact, permutation_test
 from statsmodels.stats.multitest import multipletests
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, newcombe
-from lerobot_constructskill.analysis.stats.outcomes import Counts
-from lerobot_constructskill.analysis.stats.spread import mean_p_value, spread_p_value
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count
 
 ALIKE_WITHIN = 0.2
 """Two rates are alike if the interval of their difference lies within this distance of zero."""
+
+PERMUTATIONS = 9999
+"""Number of random permutations if there are too many to try all; then p >= 0.0001."""
 
 
 class Conclusion(StrEnum):
@@ -26,17 +28,21 @@ class Conclusion(StrEnum):
     INCONCLUSIVE = "inconclusive at this number of seeds"
 
 
-class CountComparison(NamedTuple):
-    """Two variants by the number of seeds that met a criterion at least once.
+class Comparison(NamedTuple):
+    """Two variants on one criterion.
 
     Args:
         a, b: the variants.
-        counts_a, counts_b: their seed counts.
-        difference: rate of a minus rate of b, with Newcombe's interval at 1 - alpha.
-        fisher, boschloo: two-tailed p-values.
+        counts_a, counts_b: their seeds that met the criterion in at least one episode.
+        difference: rate of a's seeds minus rate of b's, with Newcombe's interval at 1 - alpha.
+        fisher, boschloo: two-tailed p-values of the counts.
         holm: Boschloo's p-value, corrected over the declared comparisons.
         probability_better: probability that a's rate is higher.
         conclusion: from `holm` and `difference`.
+        mean: mean over seeds of a's share of episodes minus that of b's.
+        mean_holm: p-value of `mean` from a permutation of seeds, corrected over the declared comparisons.
+        spread: standard deviation over seeds of a's share minus that of b's.
+        spread_holm: p-value of `spread`, likewise.
     """
 
     a: str
@@ -49,21 +55,6 @@ class CountComparison(NamedTuple):
     holm: float
     probability_better: float
     conclusion: Conclusion
-
-
-class RateComparison(NamedTuple):
-    """Two variants by the share of episodes that met a criterion, over seeds.
-
-    Args:
-        a, b: the variants.
-        mean: mean of a minus mean of b.
-        mean_holm: its p-value from a permutation of seeds, corrected over the declared comparisons.
-        spread: standard deviation of a minus that of b.
-        spread_holm: its p-value, likewise.
-    """
-
-    a: str
-    b: str
     mean: float
     mean_holm: float
     spread: float
@@ -111,43 +102,88 @@ def conclude(p_value: float, difference: Estimate, alpha: float = 0.05) -> Concl
     return Conclusion.INCONCLUSIVE
 
 
-def compare_counts(
-    counts: Mapping[str, Counts], pairs: Sequence[tuple[str, str]], alpha: float = 0.05
-) -> list[CountComparison]:
+def compare(
+    rates: Mapping[str, np.ndarray], pairs: Sequence[tuple[str, str]], alpha: float = 0.05
+) -> list[Comparison]:
     """Make those declared comparisons whose two variants have results.
 
     Args:
-        counts: variant to seed counts on one criterion; variants without a result are absent.
+        rates: variant to the share in [0, 1] of successful episodes of each seed, (seeds,); variants without a result
+            are absent.
         pairs: all declared comparisons, over which Holm's correction is taken.
         alpha: level of all of them together.
     """
-    made = [(a, b, counts[a], counts[b]) for a, b in pairs if a in counts and b in counts]
-    p_values = [boschloo(of_a, of_b) for _, _, of_a, of_b in made]
+    counts = {name: count(shares) for name, shares in rates.items()}
+    made = [(a, b) for a, b in pairs if a in rates and b in rates]
+    p_values = [boschloo(counts[a], counts[b]) for a, b in made]
+    mean_p_values, spread_p_values = (
+        [test(rates[a], rates[b]) for a, b in made] for test in (mean_p_value, spread_p_value)
+    )
+    corrected = [holm(found, len(pairs)) for found in (p_values, mean_p_values, spread_p_values)]
     compared = []
-    for (a, b, of_a, of_b), p_value, corrected in zip(made, p_values, holm(p_values, len(pairs)), strict=True):
-        difference = newcombe(of_a, of_b, level=1 - alpha)
-        conclusion = conclude(corrected, difference, alpha)
-        better = probability_better(of_a, of_b)
-        p_values_of_pair = (fisher(of_a, of_b), p_value, corrected)
-        compared.append(CountComparison(a, b, of_a, of_b, difference, *p_values_of_pair, better, conclusion))
+    for (a, b), p_value, of_counts, of_means, of_spreads in zip(made, p_values, *corrected, strict=True):
+        difference = newcombe(counts[a], counts[b], level=1 - alpha)
+        comparison = Comparison(
+            a=a,
+            b=b,
+            counts_a=counts[a],
+            counts_b=counts[b],
+            difference=difference,
+            fisher=fisher(counts[a], counts[b]),
+            boschloo=p_value,
+            holm=of_counts,
+            probability_better=probability_better(counts[a], counts[b]),
+            conclusion=conclude(of_counts, difference, alpha),
+            mean=rates[a].mean() - rates[b].mean(),
+            mean_holm=of_means,
+            spread=rates[a].std() - rates[b].std(),
+            spread_holm=of_spreads,
+        )
+        compared.append(comparison)
     return compared
 
 
-def compare_rates(rates: Mapping[str, np.ndarray], pairs: Sequence[tuple[str, str]]) -> list[RateComparison]:
-    """Make the same comparisons of shares of episodes.
+def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:
+    """Permutation test, two-tailed, of the difference of a's and b's mean over seeds.
+
+    It suits settings in which a seed succeeds in some of its episodes, where "at least once" says little.
 
     Args:
-        rates: variant to the share in [0, 1] of each seed, (seeds,).
-        pairs: all declared comparisons.
+        a, b: share in [0, 1] of each seed, (seeds,) each.
     """
-    made = [(a, b, rates[a], rates[b]) for a, b in pairs if a in rates and b in rates]
-    means, spreads = (
-        holm([test(of_a, of_b) for _, _, of_a, of_b in made], len(pairs)) for test in (mean_p_value, spread_p_value)
+    return _permuted(np.mean, a, b)
+
+
+def spread_p_value(a: np.ndarray, b: np.ndarray) -> float:
+    """Permutation test, two-tailed, of the difference of a's and b's standard deviation over seeds.
+
+    The paper closes with a question: do vision-language-action policies reduce the variance over seeds? Where a seed
+    succeeds in all its episodes or in none, the standard deviation is sqrt(p (1 - p)) of its rate p, so a variant that
+    seldom or nearly always succeeds varies little: spread has to be read beside the mean.
+
+    Seeds are exchanged between the arms, so that a small p speaks against equal distributions, in their spread; for
+    all-or-nothing seeds it cannot be smaller than what the counts allow. Tests on centred values can: ten equal seeds
+    have a deviation of exactly zero.
+
+    Args:
+        a, b: share in [0, 1] of each seed, (seeds,) each.
+    """
+    return _permuted(np.std, a, b)
+
+
+def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray) -> float:
+    def difference(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        # Rounded, or equal statistics would be told apart by their last bit.
+        return np.abs(statistic(x, axis=axis) - statistic(y, axis=axis)).round(12)
+
+    arms = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    if min(map(len, arms)) < 2:
+        return 1.0  # scipy refuses a single seed, which says nothing of other seeds
+    rng = np.random.default_rng(0)  # a generator of its own: the same p-value at every call
+    result = permutation_test(
+        arms, difference, vectorized=True, alternative="greater", n_resamples=PERMUTATIONS, rng=rng
     )
-    return [
-        RateComparison(a, b, of_a.mean() - of_b.mean(), mean, of_a.std() - of_b.std(), spread)
-        for (a, b, of_a, of_b), mean, spread in zip(made, means, spreads, strict=True)
-    ]
+    return float(result.pvalue)
 
 
 def _table(a: Counts, b: Counts) -> list[list[int]]:

@@ -5,15 +5,16 @@ from math import comb, sqrt
 
 import numpy as np
 
-from lerobot_constructskill.analysis.stats.comparisons import Conclusion, boschloo, conclude
-from lerobot_constructskill.analysis.stats.intervals import Estimate
-from lerobot_constructskill.analysis.stats.outcomes import Counts
-from lerobot_constructskill.analysis.stats.power import (
-    detectable_difference,
-    detectable_mean_difference,
-    seeds_needed_for_mean,
+from lerobot_constructskill.analysis.stats.comparisons import (
+    PERMUTATIONS,
+    Conclusion,
+    boschloo,
+    conclude,
+    mean_p_value,
 )
-from lerobot_constructskill.analysis.stats.spread import PERMUTATIONS, mean_p_value, mean_rate
+from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
+from lerobot_constructskill.analysis.stats.outcomes import Counts, count
+from lerobot_constructskill.analysis.stats.power import detectable_mean_difference, seeds_needed_for_mean
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,6 @@ class Judgement:
         conclusion: from `p_value` and `difference`.
         visible: smallest difference of means that 80 % of comparisons with so many seeds find, if seeds vary as these
             do; None if they do not vary, or a side has one seed.
-        visible_at_worst: the same if each seed succeeds always or never; None if not even the largest is found.
         seeds_needed: seeds a side that find the observed difference with 80 % power; None if there is no difference
             or `visible` is None, infinite above `power.MOST`.
     """
@@ -45,7 +45,6 @@ class Judgement:
     counts_p_value: float
     conclusion: Conclusion
     visible: float | None
-    visible_at_worst: float | None
     seeds_needed: float | None
 
 
@@ -56,10 +55,9 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         a, b: share in [0, 1] of successful episodes of each seed, (seeds,) each, one or more.
         alpha: level of the test; intervals are at 1 - alpha.
     """
-    counts_a, counts_b = (Counts(int(np.sum(rates > 0)), len(rates)) for rates in (a, b))
+    counts_a, counts_b = count(a), count(b)
     mean_a, mean_b = (mean_rate(rates, 1 - alpha) for rates in (a, b))
     apart, p_value, deviation = mean_difference(mean_a, mean_b), mean_p_value(a, b), _deviation(a, b)
-    rate = max(mean_b.value, 1 - mean_b.value)  # a rise from 1 - rate is as hard to see as a drop from rate
     return Judgement(
         counts_a=counts_a,
         counts_b=counts_b,
@@ -71,7 +69,6 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         counts_p_value=boschloo(counts_a, counts_b),
         conclusion=conclude(p_value, apart, alpha),
         visible=detectable_mean_difference(deviation, len(a), len(b), alpha) if deviation else None,
-        visible_at_worst=detectable_difference(rate, min(len(a), len(b)), alpha),
         seeds_needed=seeds_needed_for_mean(abs(apart.value), deviation, alpha) if deviation else None,
     )
 

@@ -6,6 +6,7 @@ episodes of a run repeat one trajectory (paper, section III).
 
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from lerobot_constructskill.study.rows import NOT_RUN
@@ -51,11 +52,10 @@ def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
     return runs.reset_index()
 
 
-def count(runs: pd.DataFrame, criterion: str) -> Counts:
-    """Count the runs with at least one episode that met `criterion` (paper, Table I).
+def count(rates: np.ndarray) -> Counts:
+    """Count the seeds that met a criterion in at least one episode (paper, Table I).
 
     Args:
-        runs: rows of `runs_of`.
-        criterion: one of `CRITERIA`.
+        rates: share in [0, 1] of the episodes of each seed that met it, (seeds,).
     """
-    return Counts(int((runs[criterion] > 0).sum()), len(runs))
+    return Counts(int(np.sum(rates > 0)), len(rates))

@@ -4,7 +4,6 @@ from functools import cache
 from math import ceil, inf, sqrt
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.stats import binom, hypergeom
 from statsmodels.stats.power import TTestIndPower, normal_sample_size_one_tail
 from statsmodels.stats.proportion import proportion_effectsize
@@ -28,16 +27,6 @@ def power(rate_a: float, rate_b: float, seeds: int, alpha: float = 0.05) -> floa
     Fisher's test is used because its rejection region is fast to compute; Boschloo's has more power.
     """
     return float(_joint(rate_a, rate_b, seeds)[_rejected(seeds, alpha)].sum())
-
-
-def detectable_difference(rate: float, seeds: int, alpha: float = 0.05) -> float | None:
-    """The smallest drop from `rate` that `seeds` seeds an arm show with 80 % power; None if a drop to 0 does not show.
-
-    A rise from 1 - `rate` is as hard to see.
-    """
-    if power(rate, 0.0, seeds, alpha) < TARGET:
-        return None
-    return float(brentq(lambda drop: power(rate, rate - drop, seeds, alpha) - TARGET, 0.0, rate, xtol=1e-4))
 
 
 @cache

@@ -1,9 +1,9 @@
-"""The pretrained encoders that frozen_vit can stand on: the entries of `BACKBONES`, and any of timm or transformers.
+"""The pretrained encoders that frozen_vit can use: the entries of `BACKBONES`, and any of timm or transformers.
 
 An entry describes its encoder here. A model that is named as `timm/...` or `hf/...` is described by its own
-configuration: its pixel statistics, token layout and pooled feature are the model's own. Without a commit behind its
-name it is what the Hub's `main` holds when it is first loaded: the sha256 that is then recorded pins its weights from
-there on. A commit also pins what the model is and which pixels it takes.
+configuration: its pixel statistics, token layout and pooled feature are the model's own. A name without a commit takes
+what the Hub's `main` holds when it is first loaded; the sha256 that is then recorded pins the weights. A commit also
+pins the architecture and the pixel statistics.
 """
 
 import os.path
@@ -45,7 +45,7 @@ FINE_STAGES = [2, 3]
 """Stages of a network in timm that shrink an image 8 and 16 times."""
 
 DESCRIPTIONS = ("config.json", "preprocessor_config.json")
-"""Files that say which model of transformers lies in a folder, and which pixels it takes."""
+"""Files of a model of transformers: its architecture, and its pixel statistics."""
 
 
 def get_backbone(name: str, path: str | None = None) -> Backbone:

@@ -151,11 +151,15 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     def _check(self) -> None:
         check(self)
         check_backbone(self.backbone)
-        _check_crop(self.crop)
         _check_action_names(self.action_names)
         identity = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
         coeff = self.temporal_ensemble_coeff
         conflicts = (
+            (
+                self.crop is not None and not _encloses_pixels(self.crop),
+                f"crop must be left, top, right and bottom in shares of the image, at least two pixels of "
+                f"{IMAGE_SIZE} apart, such as [0.25, 0.25, 0.75, 0.75]; got {self.crop}.",
+            ),
             (
                 self.standardize_features and self.readout != "cls",
                 f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
@@ -261,17 +265,11 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         return None
 
 
-def _check_crop(crop: list[float] | None) -> None:
-    """Refuse edges that enclose no pixels of an image."""
-    if crop is None:
-        return
-    left, top, right, bottom = crop if len(crop) == 4 else (0, 0, 0, 0)
+def _encloses_pixels(crop: list[float]) -> bool:
     least = 2 / IMAGE_SIZE  # rounding its edges may leave nothing of a single pixel
-    if not (0 <= left <= right - least <= 1 - least and 0 <= top <= bottom - least <= 1 - least):
-        raise InputError(
-            f"crop must be left, top, right and bottom in shares of the image, at least two pixels of "
-            f"{IMAGE_SIZE} apart, such as [0.25, 0.25, 0.75, 0.75]; got {crop}."
-        )
+    return len(crop) == 4 and all(
+        0 <= first <= last - least <= 1 - least for first, last in zip(crop[:2], crop[2:], strict=True)
+    )
 
 
 def _check_action_names(names: Any) -> None:

@@ -22,7 +22,7 @@ PATCHES_FILE = "patch_features.npy"
 """Memory map of the patch features in the root of a feature set: (N, P, D) float16, row i is the frame `index` i."""
 
 BOUND = "patches_sha256"
-"""Name in the description of a feature column: `_identity` of the patch features beside it."""
+"""Entry of a feature column's description: hash of the patch features that belong to it, as of `_identity`."""
 
 
 def feature_key(camera: str) -> str:
@@ -52,7 +52,7 @@ def open_patches(root: Path) -> Tensor:
 
 
 def bind_patches(root: Path) -> None:
-    """Write into a feature set's description which patch features are its own."""
+    """Write the hash of a feature set's patch features into its description."""
     info = DATA_SET.read(root / INFO)
     key = _feature_column(info)
     info["features"][key]["info"][BOUND] = _identity(root, key, np.load(root / PATCHES_FILE, mmap_mode="r"))
@@ -121,14 +121,15 @@ def describe(
 
 
 def stated(column: Mapping | None, name: str, known: Sequence[str] | None = None) -> str | None:
-    """Return what the description of a feature column states by some name.
+    """Return one entry of a feature column's description.
 
     Args:
         column: the column's entry in the data set's `features`.
-        known: the values that count; by default every text.
+        name: the entry.
+        known: the values that are accepted; by default every text.
 
     Returns:
-        None where there is no column, or it states nothing that counts.
+        None if there is no column, no such entry, or its value is not accepted.
     """
     found = ((column or {}).get("info") or {}).get(name)
     return found if isinstance(found, str) and (known is None or found in known) else None

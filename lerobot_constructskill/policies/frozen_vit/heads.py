@@ -27,14 +27,14 @@ class ChunkHeads(nn.Module):
         spec = READOUTS[config.readout]
         self.chunk_shape = (config.chunk_size, len(config.action_names) - 1)
         self.action_scale = config.action_scale
-        self.readout = spec.build(feature_dim)
+        self.readout = spec.build(feature_dim) if spec.build else nn.Identity()
         input_dim = spec.dim(feature_dim) + (config.input_features[OBS_STATE].shape[0] if config.use_state else 0)
         hidden = [config.head_hidden_dim] * config.head_hidden_layers if config.head_hidden_dim else []
         self.translation = _head(input_dim, hidden, self.chunk_shape[0] * self.chunk_shape[1])
         self.gripper = _head(input_dim, hidden, self.chunk_shape[0])
 
     def forward(self, pooled: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return a chunk and what the readout made, for pooled tokens (B, ...).
+        """Return a chunk and the readout's vector, for pooled tokens (B, ...).
 
         Returns:
             (B, T, A), bounded translations in metres (and rotations in radians), then the gripper's logit or number;
@@ -65,18 +65,18 @@ def heads_loss(
     read: Tensor,
     target: Tensor,
     padded: Tensor,
-    told: Tensor | None = None,
+    points: Tensor | None = None,
     reduction: str = "mean",
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Compare what `ChunkHeads` returned with actions, and what its readout made with what that is told.
+    """Compare the output of `ChunkHeads` with actions, and the vector of its readout with the points in the image.
 
     Args:
         config: says the losses and their weights.
         chunk: (B, T, A), from `ChunkHeads`.
-        read: (B, ...), what its readout made.
+        read: (B, ...), the readout's vector, from `ChunkHeads`.
         target: (B, T, A), the gripper +1 or -1.
         padded: (B, T), true for steps beyond an episode's end.
-        told: (B, ...), what a readout that has a loss of its own learns from.
+        points: (B, 2P), the positions that a readout with points learns from; None for other readouts.
         reduction: "mean" over all valid steps (of the readout's loss over samples), or "none" for each sample (B,).
 
     Returns:
@@ -94,7 +94,7 @@ def heads_loss(
         loss = (config.regression_weight * regression + gripper).sum(dim=1) / n_valid.clamp(min=1)
     else:
         loss = config.regression_weight * terms["regression_loss"] + terms["gripper_loss"]
-    if told is not None:
-        terms["point_loss"] = READOUTS[config.readout].loss(read, told, reduction)
+    if points is not None:
+        terms["point_loss"] = READOUTS[config.readout].loss(read, points, reduction)
         loss = loss + config.point_weight * terms["point_loss"]
     return loss, terms

@@ -19,24 +19,23 @@ from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
-from .configuration_frozen_vit import TRANSLATION_NAMES, FrozenViTChunkConfig
+from .configuration_frozen_vit import FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
 from .feature_sets import check_features, describe, open_patches, stated
-from .heads import ChunkHeads, heads_loss, offsets
+from .heads import ChunkHeads, heads_loss
 from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
 from .readouts import READOUTS
 from .shared_encoder import POOLED, SharedEncoders
 from .weights import load_weights, read_tensors, state_sha256
 
-HELDOUT_METRIC = "heldout_translation_mse_m2"
 BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
 DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "gripper_head", "action_scale")
-"""Fields that give other numbers of the same shape to the heads, or read other actions out of theirs."""
+"""Fields that change the meaning of the heads' inputs or outputs, and no shape."""
 
 SILENT = 1e-3
-"""A feature whose standard deviation is below this share of the median one is not divided by it."""
+"""A feature whose standard deviation is below this share of the median one counts as constant and is not scaled."""
 
 logger = logging.getLogger(__name__)
 
@@ -80,11 +79,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.encoder_record = self._begin_record(encoder_record)
         spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
-        self._check_column()
+        self._check_features(dataset_meta.root if dataset_meta is not None else None)
         if encoder_record is None:
             check_native(config.backbone_precision, config.device)
             self._load_backbone()
-        self._find_patches(dataset_meta.root if dataset_meta is not None else None)
         self.heads = self.fresh_heads()
 
         self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
@@ -94,7 +92,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
         self.register_state_dict_post_hook(_drop_backbone)
         self.register_load_state_dict_post_hook(_excuse_backbone)
-        self._heldout = (0.0, 0)
         self._has_seen = False
         self.reset()
 
@@ -112,35 +109,23 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Return the loss on a batch of chunks, and its terms as floats.
 
-        In evaluation mode the translation error is also added up: LeRobot keeps nothing but the loss on held-out data.
-
         Args:
-            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A) and `action_is_pad` (B, T); for a readout
-                that finds points also where they are, (B, 2P).
+            batch: images (B, 3, H, W) or features (B, D), `action` (B, T, A), and `action_is_pad` (B, T) where some
+                steps lie beyond an episode's end; for a readout that finds points also their positions, (B, 2P).
             reduction: "mean" over all valid steps (of points over samples), or "none" for one loss per sample (B,).
-
-        Raises:
-            ValueError: the batch lacks the points.
         """
-        points = batch.get(self.config.point_key) if self.readout.points else None
-        if self.readout.points and points is None:
-            raise self._lacks_points()
+        points = batch[self.config.point_key] if self.readout.points else None
         chunk, read = self.heads(*self.head_inputs(batch))
-        if not self.training:
-            error, count = self._translation_error(chunk, batch)
-            self._heldout = (self._heldout[0] + error, self._heldout[1] + count)
-        loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], _padded(batch), points, reduction)
+        nothing = torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool)
+        padded = batch.get(f"{ACTION}_is_pad", nothing)
+        loss, terms = heads_loss(self.config, chunk, read, batch[ACTION], padded, points, reduction)
         return loss, {name: term.mean().item() for name, term in terms.items()}
 
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
-        """Switch the heads' mode; back in training mode, log the error of the held-out pass that came before."""
+        """Switch the heads' mode, and record what computes the features that they learn from."""
         if mode and self.config.feature_column is None:  # the heads learn from this encoder's own features
             own = {"precision": self.backbone.precision, "runtime": self.backbone.runtime}
             self.encoder_record = replace(self.encoder_record, **own)
-        error, count = self._heldout
-        if mode and count:
-            self._heldout = (0.0, 0)
-            logger.info("%s=%.4e", HELDOUT_METRIC, error / count)  # LeRobot's meters print three decimals
         return super().train(mode)
 
     @torch.no_grad()
@@ -203,9 +188,9 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         return model
 
     def _begin_record(self, recorded: EncoderRecord | None) -> EncoderRecord:
-        """Return what is known of the encoder before its weights are there, and settle its precision.
+        """Return the record as far as it is known without weights, and set the precision in the configuration.
 
-        A data set's features say what they are. Otherwise the checkpoint, or without one the configuration, does.
+        The facts come from the data set's features, else from the checkpoint, else from the configuration.
         """
         config, column = self.config, self.config.feature_column
         asked = config.backbone_sha256 or stated(column, "weights_sha256")
@@ -215,12 +200,15 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         runtime = stated(column, "runtime", RUNTIMES) or known.runtime
         return replace(known, precision=trained or config.backbone_precision, runtime=runtime)
 
-    def _check_column(self) -> None:
-        """Refuse features that were made by another encoder."""
+    def _check_features(self, root: Path | None) -> None:
+        """Refuse features of another encoder, or without the patch features that are read; they lie in `root`."""
+        self.patches_root = root
         record, encoder, column = self.encoder_record, self.backbone, self.config.feature_column
         if column is not None:
             made_by = describe(encoder.spec, record.sha256, record.precision, encoder.crop, encoder.blind)
             check_features(column, made_by, encoder.spec.feature_dim)
+            if self.readout.reads_patches:
+                open_patches(root)
 
     def _check_data_set(self, meta: Any) -> None:
         """Refuse a data set of another rate, or without the points that the readout learns to find."""
@@ -231,19 +219,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             )
         found = meta.features.get(self.config.point_key, {}).get("names")
         if self.readout.points and found != [*self.readout.points]:
-            raise self._lacks_points()
-
-    def _lacks_points(self) -> InputError:
-        return InputError(
-            f"readout={self.config.readout} learns from {self.config.point_key} ({', '.join(self.readout.points)}): "
-            "train on a feature set that constructskill-encode makes with --patches=true --points=true."
-        )
-
-    def _find_patches(self, root: Path | None) -> None:
-        """Keep the folder of a data set's patch features, and refuse one without them if they are to be read."""
-        self.patches_root = root
-        if self.config.feature_column is not None and self.readout.reads_patches:
-            open_patches(root)
+            raise InputError(
+                f"readout={self.config.readout} learns from {self.config.point_key} "
+                f"({', '.join(self.readout.points)}): train on a feature set that constructskill-encode makes with "
+                "--patches=true --points=true."
+            )
 
     def _log_crossing(self) -> None:
         """Log that features are computed otherwise than those that the heads learned from."""
@@ -297,8 +277,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             FileNotFoundError: it lacks the patch features that the readout takes.
         """
         self.config.set_dataset_feature_metadata(meta.features)
-        self._check_column()
-        self._find_patches(meta.root)
+        self._check_features(meta.root)
 
     def pool(self, images: Tensor) -> Tensor:
         """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
@@ -322,17 +301,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if OBS_STATE not in batch:
             raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
         return pooled, batch[OBS_STATE]
-
-    @torch.no_grad()
-    def translation_error(self, batch: dict[str, Tensor]) -> tuple[float, int]:
-        """Return the sum of a batch's squared translation errors over valid steps, in m2, and of how many numbers."""
-        return self._translation_error(self._raw_chunk(batch), batch)
-
-    def _translation_error(self, chunk: Tensor, batch: dict[str, Tensor]) -> tuple[float, int]:
-        padded = _padded(batch)
-        metres = [i for i, name in enumerate(self.config.action_names) if name in TRANSLATION_NAMES]
-        squares = offsets(chunk, batch[ACTION], padded)[..., metres].square()
-        return squares.sum().item(), int((~padded).sum()) * len(metres)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         return self.heads(*self.head_inputs(batch))[0]
@@ -399,11 +367,6 @@ def _read_record(checkpoint: str | Path, options: Mapping[str, Any]) -> EncoderR
         ) from error
 
 
-def _padded(batch: Mapping[str, Tensor]) -> Tensor:
-    """Return which steps (B, T) lie beyond an episode's end; none where the batch does not say."""
-    return batch.get(f"{ACTION}_is_pad", torch.zeros_like(batch[ACTION][..., 0], dtype=torch.bool))
-
-
 def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metadata: dict) -> None:
     if not policy.config.save_backbone:
         for name in [name for name in state if name.startswith(prefix + BACKBONE_PREFIX)]:
@@ -411,5 +374,5 @@ def _drop_backbone(policy: FrozenViTChunkPolicy, state: dict, prefix: str, metad
 
 
 def _excuse_backbone(policy: FrozenViTChunkPolicy, incompatible: Any) -> None:
-    """Let state dicts be without the backbone, whose hash tells whether it is whole."""
+    """Let a state dict lack the backbone; the hash of the backbone is checked on its own."""
     incompatible.missing_keys[:] = [name for name in incompatible.missing_keys if BACKBONE_PREFIX not in name]

@@ -22,11 +22,6 @@ POINT_SCALE = 8.0
 """Factor on the positions that `heat_maps` returns: from -1 to 1 the millimetres that count are lost on the heads."""
 
 
-def _identity(dim: int) -> nn.Module:
-    """Leave the pooled tokens as they are."""
-    return nn.Identity()
-
-
 @dataclass(frozen=True)
 class Readout:
     """What the heads see of an image.
@@ -34,7 +29,8 @@ class Readout:
     Args:
         pool: `(cls (B, D), patches (B, N, D)) -> (B, ...)`: what is taken of the tokens, without parameters.
         dim: `D -> length` of the vector.
-        build: `D -> module` that trains with the heads and makes the vector of what `pool` took.
+        build: `D -> module` that trains with the heads and makes the vector of what `pool` took. None: that is the
+            vector.
         reads_patches: whether `pool` looks at the patches at all.
         points: names of the positions in the image that the vector holds, times `POINT_SCALE`. In training it learns
             them from the data set's.
@@ -42,14 +38,14 @@ class Readout:
 
     pool: Callable[[Tensor, Tensor], Tensor]
     dim: Callable[[int], int]
-    build: Callable[[int], nn.Module] = _identity
+    build: Callable[[int], nn.Module] | None = None
     reads_patches: bool = True
     points: Sequence[str] = ()
 
     @property
     def learns(self) -> bool:
         """Whether the module has parameters, so that what it returns changes in training."""
-        return self.build is not _identity
+        return self.build is not None
 
     def loss(self, read: Tensor, points: Tensor, reduction: str = "mean") -> Tensor:
         """Return how far, along x and y, the points are from where they were found. Half the image is 1.

@@ -52,7 +52,7 @@ class SharedEncoders:
 
 
 class FrameCache:
-    """Remembers what an encoder made of every frame.
+    """Remembers the features of every frame.
 
     At a fixed position a policy's episodes repeat frame for frame, and simulating a step costs less than encoding it.
 
@@ -78,7 +78,7 @@ class FrameCache:
         return [self._seen[key] for key in keys]
 
     def encode(self, images: list[Tensor]) -> Sequence[Tensor]:
-        """The same without the memory, for one image or more."""
+        """Encode one image or more, without the memory."""
         if images[0].device.type != "cpu":
             # A GPU's sums depend on the size of a batch, and how many frames are new on what runs beside.
             whole = [*images, *[images[-1]] * (-len(images) % BATCH)]
@@ -90,7 +90,7 @@ class FrameCache:
 
 
 def _identity(policy: PreTrainedPolicy) -> Hashable:
-    """Return what is equal for policies that take the same of an image."""
+    """Return a key that is equal for policies that compute the same from an image."""
     config, encoder = policy.config, policy.backbone
     described = describe(encoder.spec, policy.encoder_record.sha256, encoder.precision, encoder.crop, encoder.blind)
     return *described.values(), config.camera, config.readout, config.device

@@ -57,7 +57,8 @@ def train_seeds(
     preprocess, _ = make_pre_post_processors(template.config, dataset_stats=dataset.meta.stats)
     table = _read_table(template, dataset, preprocess)
     inputs = _head_inputs(template, table)
-    rows = torch.nonzero(~_is_among(dataset, held_out)).squeeze(1)
+    is_held_out = torch.isin(_episodes(dataset), torch.tensor(list(held_out), dtype=torch.int64))
+    rows = torch.nonzero(~is_held_out).squeeze(1)
     heads = [_fresh_heads(template, seed) for seed in seeds]
     n_steps = epochs * -(-len(rows) // batch_size)
     batches = Progress(_batches(rows, seeds, epochs, batch_size), f"training {len(seeds)} seeds", n_steps, unit="step")
@@ -83,11 +84,6 @@ def _batches(rows: Tensor, seeds: Sequence[int], epochs: int, batch_size: int) -
     for _ in range(epochs):
         orders = [rows[torch.randperm(len(rows), generator=generator)] for generator in generators]
         yield from torch.stack(orders).split(batch_size, dim=1)
-
-
-def _is_among(dataset: LeRobotDataset, episodes: Sequence[int]) -> Tensor:
-    """Return which rows (N,) belong to one of some episodes."""
-    return torch.isin(_episodes(dataset), torch.tensor(list(episodes), dtype=torch.int64))
 
 
 def _episodes(dataset: LeRobotDataset) -> Tensor:

