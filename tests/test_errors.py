@@ -127,8 +127,8 @@ def test_a_path_that_is_no_text_is_one_sentence(command: str, run: Run, tmp_path
         (
             ">/dev/full",
             1,
-            "constructskill-config: standard output cannot be written to (No space left on device); what was asked "
-            "for is done\n",
+            "constructskill-config: standard output cannot be written to (No space left on device); the work is "
+            "done\n",
         ),
     ],
 )

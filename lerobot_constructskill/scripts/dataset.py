@@ -28,7 +28,7 @@ class CheckConfig(Checked):
     root: Path | None = None  # its folder
     revision: Text | None = None  # tag, branch or commit on the Hub
 
-    def open(self) -> DataSet:
+    def read(self) -> DataSet:
         """The data set, downloaded where it is not here. Raises as `locate` and `open_dataset` do."""
         return open_dataset(locate(self.repo_id, self.root, self.revision))
 
@@ -41,7 +41,7 @@ def check_dataset(config: CheckConfig) -> str:
         MissingError: there is no such data set.
         InputError: something is wrong with it, or neither a name nor a folder was given.
     """
-    data, wrong = config.open(), 0
+    data, wrong = config.read(), 0
     for name, found in examine(data):
         wrong += bool(found)
         with Progress.external_write_mode():
@@ -139,7 +139,7 @@ def replay_dataset(config: ReplayConfig) -> str:
         InputError: there is no such episode, or an outcome differs.
         OSError: this machine has no simulator that starts.
     """
-    data = config.open()
+    data = config.read()
     everything = range(len(data.episodes))
     episodes = list(everything) if config.episodes is None else config.episodes
     if not episodes or not set(episodes) <= set(everything):
