@@ -35,7 +35,7 @@ class Drive:
 
 
 @dataclass
-class Episode:
+class RunningEpisode:
     """An episode of a round: its frames, in the columns of `columns.dagger_features`, and how it went."""
 
     seed: int
@@ -82,7 +82,7 @@ def drive_all(
     drive: Drive,
     together: int,
     n_workers: int | None = None,
-) -> Iterator[Episode]:
+) -> Iterator[RunningEpisode]:
     """Yield an episode of each seed as soon as it is over. No episode depends on those beside it.
 
     Args:
@@ -120,11 +120,11 @@ def copies(learner: Agent, count: int) -> list[Agent]:
     return [learner, *(deepcopy(learner, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 
-def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, Episode]:
+def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, RunningEpisode]:
     for lane, seed in seeds.items():
         agents[lane].reset(seed)
     steps = _unwrap(sims.reset(seeds))
-    return {lane: Episode(seed, steps[lane], np.random.default_rng([seed, 1])) for lane, seed in seeds.items()}
+    return {lane: RunningEpisode(seed, steps[lane], np.random.default_rng([seed, 1])) for lane, seed in seeds.items()}
 
 
 def _unwrap(results: Mapping[int, Any]) -> Mapping[int, Any]:

@@ -14,7 +14,7 @@ from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Machine, Node
 from lerobot_constructskill.contract import get_task
-from lerobot_constructskill.dagger.driving import Drive, Episode, drive_all
+from lerobot_constructskill.dagger.driving import Drive, RunningEpisode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
 from lerobot_constructskill.demos.merge import aggregate
@@ -50,7 +50,7 @@ class DrivenEpisode:
     by_expert: int
 
     @classmethod
-    def of(cls, episode: Episode) -> "DrivenEpisode":
+    def of(cls, episode: RunningEpisode) -> "DrivenEpisode":
         by_expert = sum(frame["dagger.actor"] == EXPERT for frame in episode.frames)
         return cls(episode.seed, episode.placed, len(episode.frames), by_expert)
 
@@ -139,7 +139,7 @@ class Round(Node):
         driven = Driven(file_sha256(weights) if weights.exists() else None, outcomes)
         (folder / OUTCOMES).write_text(json.dumps(asdict(driven)) + "\n", encoding="utf-8")
 
-    def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[Episode]:
+    def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[RunningEpisode]:
         agent = PolicyAgent.from_pretrained(checkpoint, **self.policy.learner.acting)
         expert = make_expert(get_task(self.base.config.task), self.base.config.expert)
         drive = Drive(self.number, self.beta, self.patience)

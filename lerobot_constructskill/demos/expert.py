@@ -24,7 +24,7 @@ class Phase(StrEnum):
 
 
 @dataclass(frozen=True)
-class Progress:
+class ExpertProgress:
     """How far an expert has come.
 
     Args:
@@ -103,10 +103,10 @@ class Advice:
 class Expert(Protocol):
     """A scripted controller, made from an `ExpertConfig`."""
 
-    def start(self, state: PrivilegedState) -> Progress:
+    def start(self, state: PrivilegedState) -> ExpertProgress:
         """The progress before the first action."""
 
-    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]:
+    def act(self, state: PrivilegedState, progress: ExpertProgress) -> tuple[np.ndarray, Phase, ExpertProgress | None]:
         """One step of a demonstration.
 
         Returns:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
-from lerobot_constructskill.demos.expert import Advice, ExpertConfig, Phase, Progress
+from lerobot_constructskill.demos.expert import Advice, ExpertConfig, ExpertProgress, Phase
 from lerobot_constructskill.demos.state import GROUNDED, PrivilegedState
 
 GRAVITY = 9.81  # m/s2
@@ -52,24 +52,24 @@ class PickPlaceExpert:
 
     config: ExpertConfig
 
-    def start(self, state: PrivilegedState) -> Progress:
-        return Progress(PHASES[0], 0, state.tcp)
+    def start(self, state: PrivilegedState) -> ExpertProgress:
+        return ExpertProgress(PHASES[0], 0, state.tcp)
 
-    def act(self, state: PrivilegedState, progress: Progress) -> tuple[np.ndarray, Phase, Progress | None]:
+    def act(self, state: PrivilegedState, progress: ExpertProgress) -> tuple[np.ndarray, Phase, ExpertProgress | None]:
         while self._is_over(state, progress):
-            progress = Progress(PHASES[PHASES.index(progress.phase) + 1], 0, state.tcp)
+            progress = ExpertProgress(PHASES[PHASES.index(progress.phase) + 1], 0, state.tcp)
         action = self._action(state, progress).astype(np.float32)
         after = replace(progress, steps=progress.steps + 1)
         return action, progress.phase, None if self._is_last(state, after) else after
 
-    def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
+    def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
         """Whether the demonstration is over with the action that led to `after`."""
         return after.phase is PHASES[-1] and after.steps >= self.config.release_dwell
 
-    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _action(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         return np.array([*self._translation(state, progress), GRIPPER[progress.phase]])
 
-    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+    def _is_over(self, state: PrivilegedState, progress: ExpertProgress) -> bool:
         """Whether the phase has ended and the next one begins; RELEASE is the last."""
         if progress.phase is Phase.GRASP:
             return progress.steps >= self.config.grasp_dwell
@@ -77,7 +77,7 @@ class PickPlaceExpert:
             return False
         return bool(np.linalg.norm(self._error(state, progress)) < self.config.threshold)
 
-    def _translation(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _translation(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         if progress.phase in (Phase.GRASP, Phase.RELEASE):
             return np.zeros(3)
         if progress.phase in (Phase.LIFT, Phase.CARRY):
@@ -91,13 +91,13 @@ class PickPlaceExpert:
     def _toward(self, error: np.ndarray, longest: float) -> np.ndarray:
         return np.clip(self.config.gain * error, -longest, longest)
 
-    def _error(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _error(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         """What lies between the state and the end of the phase, (3,) metres."""
         if progress.phase is Phase.CARRY:
             return self._carry_error(state)
         return self._target(state, progress) - state.tcp
 
-    def _target(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _target(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         """Where the end effector should go in this phase, (3,) metres."""
         match progress.phase:
             case Phase.PREGRASP:
@@ -111,7 +111,7 @@ class PickPlaceExpert:
     def _grasp_point(self, state: PrivilegedState) -> np.ndarray:
         return state.object_pose[:3] + [0, 0, state.object_size[2] / 2 - self.config.finger_depth]
 
-    def _waypoint(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _waypoint(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         """The phase's target, or a point above the object until the jaws are over it: a finger that lands tips it."""
         target = self._target(state, progress)
         if progress.phase is not Phase.DESCEND:
@@ -236,10 +236,10 @@ class PickPlaceExpert:
     def _act_in(self, phase: Phase, state: PrivilegedState) -> np.ndarray:
         return self._action(state, self._beginning(phase, state)).astype(float)
 
-    def _beginning(self, phase: Phase, state: PrivilegedState) -> Progress:
+    def _beginning(self, phase: Phase, state: PrivilegedState) -> ExpertProgress:
         """The progress of a phase that has just begun, with the object taken from the ground where the hand is."""
         height = state.object_size[2] - self.config.finger_depth
-        return Progress(phase, 0, np.array([*state.tcp[:2], height]))
+        return ExpertProgress(phase, 0, np.array([*state.tcp[:2], height]))
 
 
 def _within_reach(point: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
-from lerobot_constructskill.demos.expert import Phase, Progress
+from lerobot_constructskill.demos.expert import ExpertProgress, Phase
 from lerobot_constructskill.demos.pick_place import GRAVITY, PickPlaceExpert
 from lerobot_constructskill.demos.state import OPENED, PrivilegedState
 
@@ -57,16 +57,16 @@ SEATED = 0.008
 class PreciseExpert(PickPlaceExpert):
     """Closes the loop on the object's pose from CARRY on."""
 
-    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+    def _is_over(self, state: PrivilegedState, progress: ExpertProgress) -> bool:
         is_centred = (abs(self._grasp_point(state) - state.tcp) < CENTRED).all()
         return super()._is_over(state, progress) and bool(is_centred or progress.phase is not Phase.DESCEND)
 
-    def _is_last(self, state: PrivilegedState, after: Progress) -> bool:
+    def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
         """Whether the hand has risen well clear of the object."""
         risen = state.tcp[2] - (state.object_pose[2] + state.object_size[2] / 2)
         return after.phase is Phase.RELEASE and risen > self.config.pregrasp_clearance
 
-    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _action(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         return self._release(state) if progress.phase is Phase.RELEASE else super()._action(state, progress)
 
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
@@ -120,12 +120,12 @@ class PreciseExpert(PickPlaceExpert):
 class TurningExpert(PreciseExpert):
     """Turns the jaws to the object and the object to the receptacle, whose faces are alike after half a turn."""
 
-    def _is_over(self, state: PrivilegedState, progress: Progress) -> bool:
+    def _is_over(self, state: PrivilegedState, progress: ExpertProgress) -> bool:
         turns = progress.phase in (Phase.PREGRASP, Phase.CARRY)
         is_turned = abs(self._yaw_error(state, progress.phase)) < YAW_TOLERANCE
         return super()._is_over(state, progress) and (is_turned or not turns)
 
-    def _action(self, state: PrivilegedState, progress: Progress) -> np.ndarray:
+    def _action(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         *translation, gripper = super()._action(state, progress)
         turn = np.clip(self._yaw_error(state, progress.phase), -YAW_STEP, YAW_STEP)
         return np.array([*translation, turn, gripper])

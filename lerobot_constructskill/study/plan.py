@@ -18,7 +18,7 @@ from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
-from lerobot_constructskill.study.runs import Arm, DataSet, Run
+from lerobot_constructskill.study.runs import Arm, NamedSet, Run
 from lerobot_constructskill.study.spec import SHARED, Study, Variant
 from lerobot_constructskill.training.checkpoints import check_inputs
 from lerobot_constructskill.training.recipe import Training
@@ -58,7 +58,9 @@ def list_runs(study: Study) -> list[Run]:
     return runs
 
 
-def _draws(study: Study, seeds: range, sets: dict[str, DataSet]) -> Iterator[tuple[Sequence[int], dict[str, DataSet]]]:
+def _draws(
+    study: Study, seeds: range, sets: dict[str, NamedSet]
+) -> Iterator[tuple[Sequence[int], dict[str, NamedSet]]]:
     """Training seeds, and the demonstrations of a setting that they all learn from."""
     if study.demonstrations == SHARED:
         yield seeds, sets
@@ -67,7 +69,7 @@ def _draws(study: Study, seeds: range, sets: dict[str, DataSet]) -> Iterator[tup
         yield [seed], {name: _drawn_for(seed, one) for name, one in sets.items()}
 
 
-def _drawn_for(seed: int, data: DataSet) -> DataSet:
+def _drawn_for(seed: int, data: NamedSet) -> NamedSet:
     """A training seed's own draw of some demonstrations; seed 0 has those that all seeds would share.
 
     Raises:
@@ -81,10 +83,10 @@ def _drawn_for(seed: int, data: DataSet) -> DataSet:
             f"own, none may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
         )
     moved = seed * SEEDS_APART
-    return DataSet(data.name, Demonstrations(replace(config, seed_start=config.seed_start + moved)), moved)
+    return NamedSet(data.name, Demonstrations(replace(config, seed_start=config.seed_start + moved)), moved)
 
 
-def _variant_arm(study: Study, name: str, variant: Variant, data: DataSet, common: Mapping[str, Any]) -> Arm:
+def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
         check_inputs(learner.config, common["env"]["obs_type"])
@@ -101,7 +103,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: DataSet, commo
     )
 
 
-def _rounds(study: Study, name: str, variant: Variant, data: DataSet) -> DaggerConfig:
+def _rounds(study: Study, name: str, variant: Variant, data: NamedSet) -> DaggerConfig:
     """The rounds of a variant, which begin elsewhere where its demonstrations do."""
     with _inside(f"dagger {variant.dagger}"):
         rounds = parse_named(DaggerConfig, "dagger", variant.dagger, ["--repo_id=local/any"])
@@ -113,7 +115,7 @@ def _rounds(study: Study, name: str, variant: Variant, data: DataSet) -> DaggerC
     return replace(rounds, seed_start=rounds.seed_start + data.moved)
 
 
-def _reference_arm(study: Study, name: str, sets: Mapping[str, DataSet], common: Mapping[str, Any]) -> Arm:
+def _reference_arm(study: Study, name: str, sets: Mapping[str, NamedSet], common: Mapping[str, Any]) -> Arm:
     if name not in REFERENCES:
         raise InputError(f"Unknown reference '{name}'; the references are: {', '.join(REFERENCES)}.")
     reference, setting = REFERENCES[name], common["setting"]
@@ -161,10 +163,10 @@ def resolve_env(fields: Mapping[str, Any]) -> dict[str, Any]:
     return env | {"episode_length": length, "light_robot": light_robot, "render_backend": backend}
 
 
-def _read_demonstrations(setting: str, data: str) -> DataSet:
+def _read_demonstrations(setting: str, data: str) -> NamedSet:
     with _inside(f"settings.{setting}, data {data}"):
         config = parse_named(GenerateConfig, "generate", data, ["--repo_id=local/any"])
-    return DataSet(data, Demonstrations(config))
+    return NamedSet(data, Demonstrations(config))
 
 
 @contextmanager

@@ -42,7 +42,7 @@ TRIES = 3
 
 
 @dataclass(frozen=True, eq=False)
-class DataSet:
+class NamedSet:
     """Demonstrations that a study names.
 
     Args:
@@ -76,8 +76,8 @@ class Arm:
     role: str
     env: dict[str, Any]
     evaluation: dict[str, int]
-    demonstrations: DataSet | None = None
-    validated_on: tuple[DataSet, ...] = ()
+    demonstrations: NamedSet | None = None
+    validated_on: tuple[NamedSet, ...] = ()
     learner: Learner | None = None
     training: Training | None = None
     rounds: DaggerConfig | None = None

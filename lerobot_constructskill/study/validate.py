@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.study.runs import Arm, DataSet, Run
+from lerobot_constructskill.study.runs import Arm, NamedSet, Run
 from lerobot_constructskill.training.heldout import HeldOutError
 
 logger = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
             store.note(node, failure)
 
 
-def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, DataSet]]:
+def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, NamedSet]]:
     """Arms, each with a data set to validate it on; no data set is made that only `others` need."""
     arms = {id(run.arm): run.arm for run in runs}.values()
     own = {arm.demonstrations.node for arm in arms if arm.demonstrations}
@@ -36,6 +36,6 @@ def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, Da
     return [(arm, data) for arm in arms if arm.learner for data in arm.validated_on if data.node not in spared]
 
 
-def heldout(run: Run, data: DataSet) -> HeldOutError:
+def heldout(run: Run, data: NamedSet) -> HeldOutError:
     """The held-out error of a run's policy on a set."""
     return HeldOutError(run.checkpoints, run.seed, data.node)

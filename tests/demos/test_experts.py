@@ -10,7 +10,7 @@ from kinds import KINDS
 
 from lerobot_constructskill.contract import DEMO_SEED_START, GRIPPER_OPEN, SIM_STATE, TASKS
 from lerobot_constructskill.demos.demonstrate import demonstrate
-from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, Progress, make_expert
+from lerobot_constructskill.demos.expert import ExpertConfig, ExpertProgress, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, execute
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -86,7 +86,7 @@ def test_what_little_play_is_left_narrows_as_the_object_comes_down():
 def test_the_lift_is_the_papers_or_as_high_as_the_arm_reaches(x, height):
     expert = make_expert(TASKS["brick_to_bin"], ExpertConfig())
     held = state(tcp_pose=[x, 0, 0.08, 0, 1, 0, 0])
-    target = expert._target(held, Progress(Phase.LIFT, 0, held.tcp))
+    target = expert._target(held, ExpertProgress(Phase.LIFT, 0, held.tcp))
     np.testing.assert_allclose(target - held.tcp, [0, 0, height], atol=0.01)
 
 
@@ -97,7 +97,7 @@ def test_the_paper_tasks_lift_is_rounded_as_in_the_data_sets_that_exist(mass, up
     """Each value is the first release's; another order of the same multiplication gives another last bit."""
     held = state(tcp_pose=[0, 0, 0.17, 0, 1, 0, 0])
     held = replace(held, tcp_pose=held.tcp_pose.astype(np.float32), object_mass=np.array([mass], np.float32))
-    action, *_ = make_expert(TASKS["brick_to_bin"], ExpertConfig()).act(held, Progress(Phase.LIFT, 0, held.tcp))
+    action, *_ = make_expert(TASKS["brick_to_bin"], ExpertConfig()).act(held, ExpertProgress(Phase.LIFT, 0, held.tcp))
     assert action[2] == float.fromhex(up)
 
 
