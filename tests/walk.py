@@ -1,7 +1,4 @@
-"""Rooms that the calls of a function visit, and climbs: first visits of a room above the one visited first before.
-
-Usage: python tests/walk.py lerobot_constructskill.study.session:run_study
-"""
+"""Rooms that the calls of a function visit, and climbs: first visits of a room above the one visited first before."""
 
 import ast
 import sys
