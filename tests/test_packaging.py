@@ -9,6 +9,7 @@ import tarfile
 import tomllib
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module, metadata
 from pathlib import Path
 
@@ -154,11 +155,14 @@ def test_a_name_that_is_none_is_answered_with_those_there_are(name: str) -> None
 
 
 @pytest.fixture
-def generate(monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+def generate() -> Callable[..., tuple[int, str, str]]:
     """Call a command in this process that prints some fields and makes nothing."""
-    command = import_module("lerobot_constructskill.scripts.generate")
-    monkeypatch.setattr(command, "generate", lambda config: f"{config.task} {config.episodes} {config.repo_id}")
-    return lambda *arguments: call_inside(command.main, "constructskill-generate", *arguments)
+    main = import_module("lerobot_constructskill.scripts.generate").generate.main
+    config_class, _, *others = main.args
+    told = partial(
+        main.func, config_class, lambda config: f"{config.task} {config.episodes} {config.repo_id}", *others
+    )
+    return lambda *arguments: call_inside(told, "constructskill-generate", *arguments)
 
 
 @pytest.mark.parametrize("named", ["smoke", f"{SMOKE}", f"--config_path={SMOKE}"], ids=["name", "file", "flag"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.bounds import Checked, RepoId
 from lerobot_constructskill.errors import plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 
 @dataclass
@@ -18,6 +18,7 @@ class BoardConfig(Checked):
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 
 
+@command()
 def board(config: BoardConfig) -> str:
     """Write the board and say where it is.
 
@@ -30,7 +31,3 @@ def board(config: BoardConfig) -> str:
 
     pages = write_board(config.root, config.out, config.dataset_id, config.films)
     return f"{plural(len(pages), 'page')} written; open {pages[-1]}"
-
-
-def main() -> None:
-    run(BoardConfig, board)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from lerobot_constructskill.analysis.section import Level
 from lerobot_constructskill.bounds import Among, Checked, Count, Device, Seed, Steps, Text
 from lerobot_constructskill.contract import OBS_TYPES
-from lerobot_constructskill.scripts.console import run, say
+from lerobot_constructskill.scripts.console import command, say
 
 if TYPE_CHECKING:
     from lerobot_constructskill.comparison.sides import Side, Source
@@ -67,6 +67,7 @@ class CompareConfig(Checked):
         return {name: value for name, value in asdict(self).items() if name in names and value is not None}
 
 
+@command(first=("a", "b"))
 def compare(config: CompareConfig) -> str:
     """Compare the sides and return the text to print.
 
@@ -99,7 +100,3 @@ def compare(config: CompareConfig) -> str:
         say(told)
         raise SystemExit(FAILED)
     return told
-
-
-def main() -> None:
-    run(CompareConfig, compare, first=("a", "b"))

@@ -4,9 +4,10 @@ from pathlib import Path
 
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.errors import plural
-from lerobot_constructskill.scripts.console import run, say
+from lerobot_constructskill.scripts.console import command, say
 
 
+@command(presets="dagger")
 def dagger(config: DaggerConfig) -> str:
     """Run DAgger, print a line for each policy, and return where the data set and the checkpoint are.
 
@@ -24,9 +25,5 @@ def dagger(config: DaggerConfig) -> str:
     return f"{size}: {root}/dataset, {root}/checkpoint"
 
 
-def main() -> None:
-    run(DaggerConfig, dagger, presets="dagger")
-
-
 if __name__ == "__main__":
-    main()
+    dagger.main()

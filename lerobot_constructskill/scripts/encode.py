@@ -6,7 +6,7 @@ from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.bounds import BatchSize, Device, RepoId, Text, Word, check
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 
 @dataclass
@@ -78,5 +78,6 @@ def encode(config: EncodeConfig) -> Path:
     return out_root
 
 
-def main() -> None:
-    run(EncodeConfig, lambda config: f"Feature set written to {encode(config)}")
+@command()
+def tell_encode(config: EncodeConfig) -> str:
+    return f"Feature set written to {encode(config)}"

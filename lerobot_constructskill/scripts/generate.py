@@ -2,9 +2,10 @@
 
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.errors import plural, remedy_of
-from lerobot_constructskill.scripts.console import run, say
+from lerobot_constructskill.scripts.console import command, say
 
 
+@command(presets="generate")
 def generate(config: GenerateConfig) -> str:
     from lerobot_constructskill.scripts.dataset import CardConfig, write_card
 
@@ -20,9 +21,5 @@ def generate(config: GenerateConfig) -> str:
     )
 
 
-def main() -> None:
-    run(GenerateConfig, generate, presets="generate")
-
-
 if __name__ == "__main__":
-    main()
+    generate.main()

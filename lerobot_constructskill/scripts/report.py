@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.bounds import Checked
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 
 @dataclass
@@ -30,5 +30,6 @@ def report(config: ReportConfig) -> Path:
     return write_report(config.root)
 
 
-def main() -> None:
-    run(ReportConfig, lambda config: f"Report written to {report(config)}")
+@command()
+def tell_report(config: ReportConfig) -> str:
+    return f"Report written to {report(config)}"

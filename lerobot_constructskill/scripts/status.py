@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.errors import MissingError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 
 @dataclass(frozen=True)
@@ -18,6 +18,7 @@ class StatusConfig:
     root: Path = Path("outputs/store")
 
 
+@command()
 def status(config: StatusConfig) -> str:
     """A line for each folder that other code has made, and one for all.
 
@@ -36,9 +37,5 @@ def status(config: StatusConfig) -> str:
     return "\n".join([*stale, f"{plural(len(found), 'folder')}, {len(stale)} of them made with other code"])
 
 
-def main() -> None:
-    run(StatusConfig, status)
-
-
 if __name__ == "__main__":
-    main()
+    status.main()

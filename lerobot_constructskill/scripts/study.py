@@ -7,7 +7,7 @@ from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.bounds import Count
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.parsing import with_fields_of_bases
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 from lerobot_constructskill.study.spec import Options, Study
 
 
@@ -48,6 +48,7 @@ class StudyConfig(Options, Study):
         return replace(study, variants=variants, references=references)
 
 
+@command(presets="study")
 def study(config: StudyConfig) -> str:
     """Run a study, or look at one, and return a line about it.
 
@@ -92,9 +93,5 @@ def _text(config: StudyConfig) -> str:
     return yaml.safe_dump(text, sort_keys=False, allow_unicode=True)
 
 
-def main() -> None:
-    run(StudyConfig, study, presets="study")
-
-
 if __name__ == "__main__":
-    main()
+    study.main()

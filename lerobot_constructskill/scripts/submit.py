@@ -8,7 +8,7 @@ from typing import Annotated
 from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.bounds import Among, Text, check
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 Suite = Annotated[str, Among(tuple(BOARD_SUITES))]
 
@@ -42,6 +42,7 @@ class SubmitConfig:
             raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
 
 
+@command()
 def submit(config: SubmitConfig) -> str:
     """Write a submission and say what is in it.
 
@@ -71,7 +72,3 @@ def submit(config: SubmitConfig) -> str:
         f"{plural(len(made.declaration.training_seeds), 'training seed')}, "
         f"{size / 1e6:.2f} MB; now constructskill-verify."
     )
-
-
-def main() -> None:
-    run(SubmitConfig, submit)

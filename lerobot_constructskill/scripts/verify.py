@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.bounds import Count, Text, Workers, check
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.scripts.console import run
+from lerobot_constructskill.scripts.console import command
 
 
 @dataclass
@@ -31,6 +31,7 @@ class VerifyConfig:
             raise InputError("A verdict is about all episodes: --record cannot be combined with --sample.")
 
 
+@command()
 def verify(config: VerifyConfig) -> str:
     """Verify a submission and return the verdict.
 
@@ -64,7 +65,3 @@ def verify(config: VerifyConfig) -> str:
         f"({plural(sum(claim.steps for claim in replayed), 'step')}), each ended as claimed; {failed} failed with an "
         f"error.{told}"
     )
-
-
-def main() -> None:
-    run(VerifyConfig, verify)

@@ -7,7 +7,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from lerobot_constructskill.artifacts.pools import EXECUTORS
-from lerobot_constructskill.bounds import Among, Count, Pattern, Range, Seed, Text, Workers, check, check_fields
+from lerobot_constructskill.bounds import (
+    Among,
+    Checked,
+    Count,
+    Pattern,
+    Range,
+    Seed,
+    Text,
+    Workers,
+    check,
+    check_fields,
+)
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.training.recipe import Training
 
@@ -166,7 +177,7 @@ def video_path(setting: str, name: str) -> Path:
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Checked):
     """How a study is run.
 
     Args:
@@ -188,6 +199,3 @@ class Options:
     executor: Annotated[str, Among(EXECUTORS)] = "processes"
     workers: Workers = 2
     retry_failed: bool = False
-
-    def __post_init__(self):
-        check(self)

@@ -380,8 +380,8 @@ def test_numbers_as_they_are_written():
 COMMAND = """
 import sys
 sys.argv = ["constructskill-report", "--root={root}"]
-from lerobot_constructskill.scripts.report import main
-main()
+from lerobot_constructskill.scripts.report import tell_report
+tell_report.main()
 print({{"torch", "lerobot", "sapien", "mani_skill"}} & set(sys.modules))
 """
 

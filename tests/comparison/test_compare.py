@@ -174,7 +174,7 @@ def test_the_status_fails_only_where_it_is_asked_to_and_a_is_worse(study, capsys
         monkeypatch.setattr("sys.argv", ["constructskill-compare", a, b, *flags])
         monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         try:
-            script.main()
+            script.compare.main()
             found = 0
         except SystemExit as ended:
             found = ended.code

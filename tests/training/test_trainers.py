@@ -124,8 +124,8 @@ def look(*arguments):
     os._exit(0 if torch.get_num_threads() == 2 and (smallest == 0).all() else 7)
 
 module.{first} = look
-from lerobot_constructskill.scripts.{command} import main
-main()
+from lerobot_constructskill.scripts.{command} import {command}
+{command}.main()
 """
 
 
