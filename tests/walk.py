@@ -10,15 +10,16 @@ BELOW = {room(module): set() for module in SOURCES}
 for module, path in SOURCES.items():
     BELOW[room(module)] |= {room(found.target) for found in imports(path) if is_ours(found.target)} - {room(module)}
 HEIGHT = {name: height for height, name in enumerate(TopologicalSorter(BELOW).static_order())}
-TREES = {module: ast.parse(path.read_text()) for module, path in SOURCES.items()}
+NODES = {module: [*ast.walk(ast.parse(path.read_text()))] for module, path in SOURCES.items()}
 
 
 def follow(module: str, name: str, entered: dict[tuple[str, str], None]) -> dict[tuple[str, str], None]:
     """Enter a function or class, and whatever it calls, in the order of the source."""
-    nodes = [*ast.walk(TREES[module])]
+    nodes = NODES[module]
     own = {node.name: node for node in nodes if isinstance(node, ast.FunctionDef | ast.ClassDef)}
-    known = {a.asname or a.name: (n.module, a.name) for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
     if name in own and (module, name) not in entered:
+        froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+        known = {alias.asname or alias.name: (one.module, alias.name) for one in froms for alias in one.names}
         entered[module, name] = None
         used = [node for node in ast.walk(own[name]) if isinstance(node, ast.Name)]
         for node in sorted(used, key=lambda node: (node.lineno, node.col_offset)):
