@@ -129,6 +129,11 @@ class Node:
     def digest(self) -> str:
         return digest(self.spec)
 
+    @property
+    def repo_id(self) -> str:
+        """What the node is called as a data set, where it is one."""
+        return f"local/{self.digest}"
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Node) and (self.kind, self.digest) == (other.kind, other.digest)
 

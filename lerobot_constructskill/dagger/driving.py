@@ -25,13 +25,11 @@ class Drive:
         number: number of the round, which its frames name.
         beta: probability of the expert's action in a step.
         patience: hopeless steps in a row after which an episode ends; they are dropped.
-        pictures: whether frames keep what the cameras saw, a megabyte every three steps.
     """
 
     number: int
     beta: float
     patience: int
-    pictures: bool = True
 
 
 @dataclass
@@ -52,7 +50,7 @@ class RunningEpisode:
         executed = advice.action if expert else within_bounds
         self.hopeless = self.hopeless + 1 if advice.hopeless else 0
         self.frames.append(
-            seen(self.now.seen["pixels"] if drive.pictures else {}, self.now.agent_state, self.now.sim)
+            seen(self.now.seen["pixels"], self.now.agent_state, self.now.sim)
             | decided(advice.action, advice.action, executed, advice.phase, self.seed)
             | {
                 "dagger.round": np.array([drive.number], dtype=np.int64),

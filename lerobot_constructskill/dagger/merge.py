@@ -50,8 +50,8 @@ class MergedSet(Node):
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Merge the parts and say in the sidecar who drove."""
-        config, repo_id = self.base.config, f"local/{self.digest}"
-        base = LeRobotDataset(f"local/{self.base.digest}", root=inputs["demonstrations"])
+        config, repo_id = self.base.config, self.repo_id
+        base = LeRobotDataset(self.base.repo_id, root=inputs["demonstrations"])
         driven = [inputs[f"round_{one.number}"] for one in self.rounds]
         # The disk's room is measured before the scratch folder is gone.
         with quiet(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch, room_for(folder):

@@ -118,7 +118,7 @@ class Round(Node):
             MachineError: the disk is full, this machine cannot render, or a simulator died.
         """
         shards, config = folder.with_name(SHARDS), self.base.config
-        task, repo_id = get_task(config.task), f"local/{self.digest}"
+        task, repo_id = get_task(config.task), self.repo_id
         checkpoint = checkpoint_of(self.policy.seeds.start, inputs["policy"])
         finished = {outcome.seed for outcome in whole(shards, OUTCOME, ONE.read)}
         for episode in self._drive(checkpoint, [seed for seed in self.seeds if seed not in finished], machine):

@@ -90,7 +90,7 @@ def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
             logger.warning("Policy %d is not validated: %s", number, failure.said)
         drives = number < plan.config.rounds
         drove = totals(store.get(plan.round(number + 1), machine)) if drives else None
-        frames = LeRobotDatasetMetadata(f"local/{data.digest}", root=store.get(data, machine)).total_frames
+        frames = LeRobotDatasetMetadata(data.repo_id, root=store.get(data, machine)).total_frames
         yield Line(number, frames, known_error(error, store), drove)
 
 

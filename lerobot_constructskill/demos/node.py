@@ -40,6 +40,6 @@ class Demonstrations(Node):
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Generate the demonstrations. Raises as `recorder.record` does."""
-        config = replace(self.config, repo_id=f"local/{self.digest}", workers=machine.workers)
+        config = replace(self.config, repo_id=self.repo_id, workers=machine.workers)
         check_disk(config, folder)
         write(config, folder)

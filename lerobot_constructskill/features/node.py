@@ -68,14 +68,13 @@ class Features(Node):
         """
         config = self.config
         if config.backbone_sha256 is None:
-            load_weights(
-                get_backbone(config.backbone, config.backbone_path), config.backbone_path
-            )  # says what was tried
+            spec = get_backbone(config.backbone, config.backbone_path)
+            load_weights(spec, config.backbone_path)  # says what was tried
             raise MissingWeightsError(f"The weights of {config.backbone} arrived while the study ran: start it again.")
         eyes = config.crop, config.device, config.backbone_pretrained, config.blind, config.backbone_sha256
         encoder, info = load_encoder(config.backbone, config.backbone_path, self.precision, *eyes)
         (dataset,) = _opened(self.inputs, inputs)
-        write_feature_set(dataset, config.camera, encoder, info, f"local/{self.digest}", folder, **self.beside)
+        write_feature_set(dataset, config.camera, encoder, info, self.repo_id, folder, **self.beside)
 
     @property
     def precision(self) -> str:
@@ -106,9 +105,9 @@ class JoinedFeatures(Features):
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         whole, *parts = _opened(self.inputs, inputs)
         info, camera = parts[0].meta.features[feature_key(self.config.camera)]["info"], self.config.camera
-        join_feature_sets(whole, camera, parts, info, f"local/{self.digest}", folder, **self.beside)
+        join_feature_sets(whole, camera, parts, info, self.repo_id, folder, **self.beside)
 
 
 def _opened(nodes: Mapping[str, Node], folders: Mapping[str, Path]) -> Iterator[LeRobotDataset]:
     """The data sets of some nodes, in their order."""
-    return (LeRobotDataset(f"local/{node.digest}", root=folders[name]) for name, node in nodes.items())
+    return (LeRobotDataset(node.repo_id, root=folders[name]) for name, node in nodes.items())

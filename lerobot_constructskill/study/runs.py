@@ -226,7 +226,7 @@ def _agent(job: Job, run: Run) -> Agent:
     if arm.learner:
         return PolicyAgent.from_pretrained(_checkpoint(job, run), **arm.learner.acting)
     data = arm.demonstrations and arm.demonstrations.node
-    dataset = data and LeRobotDataset(f"local/{data.digest}", root=job.store.folder(data))
+    dataset = data and LeRobotDataset(data.repo_id, root=job.store.folder(data))
     return REFERENCES[arm.name].agent(get_task(arm.env["task"]), run.seed, dataset)
 
 

@@ -94,7 +94,7 @@ class Checkpoints(Node):
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Train the seeds. Raises whatever the trainer raises."""
         flush_denormals()
-        dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
+        dataset = LeRobotDataset(self.inputs["data"].repo_id, root=inputs["data"])
         kept_out = held_out(dataset.num_episodes, self.training.holdout)
         folder.mkdir()
         config = deepcopy(self.learner.config)  # which a trainer may change

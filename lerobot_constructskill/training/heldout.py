@@ -45,7 +45,7 @@ class HeldOutError(Node):
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Measure the error. Raises as `rollout.offline.heldout_mse` does."""
-        dataset = LeRobotDataset(f"local/{self.inputs['data'].digest}", root=inputs["data"])
+        dataset = LeRobotDataset(self.inputs["data"].repo_id, root=inputs["data"])
         episodes = held_out(dataset.num_episodes, self.checkpoints.training.holdout)
         checkpoint = checkpoint_of(self.seed, inputs["checkpoint"])
         error = heldout_mse(checkpoint, dataset, episodes, **self.checkpoints.learner.acting)
