@@ -26,9 +26,10 @@ ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study,
 	.venv/bin/constructskill-study ten_seeds
 	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
 
-check: setup ## lint, and the tests that need neither simulator nor training
+check: setup ## lint, types, and the tests that need neither simulator nor training
 	.venv/bin/ruff check
 	.venv/bin/ruff format --check
+	.venv/bin/mypy | .venv/bin/mypy-baseline filter
 	$(PARALLEL) -q -m "not sim and not slow and not nightly"
 
 test: setup ## whatever a change is likely to break
