@@ -1,7 +1,7 @@
 """Steps/s of sharp keypoints, forward and back, while all threads flush denormal numbers, as in a study.
 
 Against it: the first thread alone flushes, because torch made the others before; and none does, as in `lerobot-train`.
-They take turns, each in a process of its own. Maps are random, and patterns as sharp as those that 30 passes of
+They take turns, each in a process of its own. Maps are random, and patterns as sharp as those that 30 epochs of
 `precise.yaml` leave: 3 % of the softmax is denormal.
 """
 

@@ -1,4 +1,4 @@
-"""Ten passes of ten seeds trained together on `<folder>/features`, each saved as a LeRobot checkpoint beside it.
+"""Ten epochs of ten seeds trained together on `<folder>/features`, each saved as a LeRobot checkpoint beside it.
 
 Usage: python benchmarks/ten_seeds.py <folder> <seeds> <batch size> [<weights of vit_tiny16>]
 """

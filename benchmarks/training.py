@@ -8,7 +8,7 @@ from measure import LOG, OUT, report, run
 from lerobot_constructskill.scripts.config import ConfigConfig, write
 
 RECIPE_SAMPLES = 150 * 7252
-"""What one seed of the recipe sees: 150 passes over the 70 demonstrations of the fast set that are not held out."""
+"""What one seed of the recipe sees: 150 epochs of the 70 demonstrations of the fast set that are not held out."""
 
 BATCH, STEPS = 64, 1140
 VIDEO_STEPS = 12
@@ -57,7 +57,7 @@ def main() -> None:
 
     together = run("python", "benchmarks/ten_seeds.py", str(OUT), str(SEEDS), str(BATCH))
     one = sum(seconds for seconds, _ in stock) / STOCK_RUNS
-    note = f"{STOCK_RUNS} stock runs of ten passes were timed ({one:.0f} s each) and multiplied"
+    note = f"{STOCK_RUNS} stock runs of ten epochs were timed ({one:.0f} s each) and multiplied"
     report(
         "ten seeds trained, s",
         together.seconds,

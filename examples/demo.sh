@@ -36,7 +36,7 @@ recipe=$(constructskill-config train/frozen_vit_keypoints --root="$OUT/features"
 for seed in $SEEDS; do
     train="$OUT/train/seed_$seed" eval="$OUT/eval/seed_$seed"
     if [ ! -e "$train/checkpoints/last" ]; then
-        say "Training seed $seed: lerobot-train, 12 passes over 44 demonstrations"
+        say "Training seed $seed: lerobot-train, 12 epochs of 44 demonstrations"
         rm -rf "$train" # lerobot-train refuses the folder of a run that was killed before its checkpoint
         # One thread: more would stall the two processes that load, on a machine with few cores.
         OMP_NUM_THREADS=1 with_bar "$OUT/train_$seed.log" lerobot-train --config_path="$recipe" \

@@ -287,9 +287,9 @@ def test_eighty_demonstrations_are_trained_as_long_as_before(name, written):
 
 
 def test_passes_are_counted_in_frames_that_are_trained_on(written):
-    fields = yaml.safe_load(written("frozen_vit_fast", n=16, passes=7).read_text())
+    fields = yaml.safe_load(written("frozen_vit_fast", n=16, epochs=7).read_text())
     assert fields["steps"] == fields["save_freq"] == 7 * math.ceil(14 * 104 / 64)
-    often = yaml.safe_load(written("act", n=16, passes=8).read_text())
+    often = yaml.safe_load(written("act", n=16, epochs=8).read_text())
     assert often["steps"] == 8 * 14 * 104 / 8 == 4 * often["save_freq"], "five checkpoints are not equally far apart"
 
 
@@ -298,20 +298,20 @@ def test_what_is_written_is_plain_yaml_with_every_field_of_the_policy(name, writ
     file = written(name, out=tmp_path / "mine" / "file.yaml")
     template, fields = read_fields(CONFIGS / "train" / f"{name}.yaml"), yaml.safe_load(file.read_text())
     assert file == tmp_path / "mine" / "file.yaml" and fields["policy"] == template["policy"]
-    assert not {"passes", "checkpoints"} & fields.keys()
+    assert not {"epochs", "checkpoints"} & fields.keys()
 
 
 def test_a_file_lies_beside_its_set_and_says_of_which_it_is(written, tmp_path):
     small, large = written("act", n=7), written("act", n=8)
     assert (small, large) == (tmp_path / "set_7_act.yaml", tmp_path / "set_8_act.yaml")
     assert "7 demonstrations, too few for every eighth to be held out" in small.read_text()
-    assert f"{tmp_path / 'set_8'}: 8 demonstrations, 1 of them held out; 110 passes." in large.read_text()
+    assert f"{tmp_path / 'set_8'}: 8 demonstrations, 1 of them held out; 110 epochs." in large.read_text()
 
 
 def test_a_file_of_the_users_is_not_written_over(written, tmp_path):
     file = written("act", 9)
     file.write_text(f"{file.read_text()}\n")
-    assert written("act", 9, passes=3) == file, "one of its own is made anew"
+    assert written("act", 9, epochs=3) == file, "one of its own is made anew"
     file.write_text("batch_size: 1\n")
     with pytest.raises(TakenError, match=f"{file} exists and was not written by constructskill-config: name another"):
         written("act", 9)

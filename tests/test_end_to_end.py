@@ -61,7 +61,7 @@ def test_training_reports_the_loss_on_held_out_episodes(trained):
 
 @pytest.mark.nightly
 def test_seeds_trained_together_reach_the_held_out_error_that_lerobot_train_reaches(features, folder):
-    """Sixty steps, fifteen passes. Its samples come in another order, so it is one more draw from what seeds give."""
+    """Sixty steps, fifteen epochs. Its samples come in another order, so it is one more draw from what seeds give."""
     recipe = ["--steps=60", "--eval_steps=60", "--batch_size=70", "--num_workers=0", "--save_freq=60", "--seed=0"]
     flags = ["--policy.type=frozen_vit", "--policy.push_to_hub=false", *features, *HOLD_OUT, *recipe]
     call("lerobot-train", *flags, "--env_eval_freq=0", f"--output_dir={folder / 'sixty'}")

@@ -18,14 +18,13 @@ TRAIN = "train/"
 class ConfigConfig(Checked):
     """List the shipped configurations, or print the path of one.
 
-    Those of train/ are first written for a data set:
-    lerobot-train --config_path=$(constructskill-config train/act --root=outputs/fast_wrist)
+    One of train/ is first written for a data set, into a file that `lerobot-train` reads.
     """
 
     name: Text | None = None  # KIND/NAME, KIND is dagger, generate, policy, study or train; default: list all
     root: Path | None = None  # for train/: the data set's folder
     repo_id: RepoId | None = None  # for train/: its name; without root, of one in LeRobot's cache or on the Hub
-    passes: Count | None = None  # for train/: how often each frame is trained on; default: as the configuration says
+    epochs: Count | None = None  # for train/: how often each frame is trained on; default: as the configuration says
     out: Path | None = None  # for train/: the file to write; default: beside the data set's folder, or in outputs/
 
 
@@ -69,28 +68,28 @@ def write(config: ConfigConfig) -> Path:
     folder = Path(os.path.abspath(config.root or Path("outputs") / config.repo_id.partition("/")[2]))
     source = {"repo_id": config.repo_id or f"local/{folder.name}"} | ({"root": str(folder)} if config.root else {})
     file = config.out or folder.with_name(f"{folder.name}_{config.name.removeprefix(TRAIN)}.yaml")
-    split, passes = split_of(locate(config.repo_id, config.root)), config.passes or template["passes"]
+    split, epochs = split_of(locate(config.repo_id, config.root)), config.epochs or template["epochs"]
     held_out = f"{split.n_held_out} of them" if split.n_held_out else "too few for every eighth to be"
     text = (
         f"# {config.name} for {config.root or config.repo_id}: {plural(len(split.episodes), 'demonstration')}, "
-        f"{held_out} held out; {passes} {'pass' if passes == 1 else 'passes'}.\n"
+        f"{held_out} held out; {epochs} {'epoch' if epochs == 1 else 'epochs'}.\n"
         "# constructskill-config wrote it for this data set alone: for another set let it write another file.\n"
     )
     if file.exists() and not read_bytes(file).startswith(f"# {TRAIN}".encode()):
         raise TakenError(f"{file} exists and was not written by constructskill-config: name another with --out.")
-    steps = passes * ceil(split.frames / template["batch_size"])  # the last batch of a pass may be smaller
-    # Only as many checkpoints as have equally many whole passes between them, so that the last is of the last step.
-    often = steps // max(n for n in range(1, template["checkpoints"] + 1) if passes % n == 0)
+    steps = epochs * ceil(split.frames / template["batch_size"])  # the last batch of an epoch may be smaller
+    # Only as many checkpoints as have equally many whole epochs between them, so that the last is of the last step.
+    often = steps // max(n for n in range(1, template["checkpoints"] + 1) if epochs % n == 0)
     fields = {
         "dataset": {**source, "episodes": split.episodes, "eval_split": split.eval_split},
-        **{name: value for name, value in template.items() if name not in ("passes", "checkpoints")},
+        **{name: value for name, value in template.items() if name not in ("epochs", "checkpoints")},
         **{"steps": steps, "save_freq": often, "eval_steps": often if split.n_held_out else 0},
     }
     write_text(file, text + yaml.safe_dump(fields, sort_keys=False, default_flow_style=None, width=119))
     return file
 
 
-@command(first=["name"])
+@command("lerobot-train --config_path=$(constructskill-config train/act --root=outputs/fast_wrist)", first=("name",))
 def show_or_write(config: ConfigConfig) -> str:
     """What `show` returns, or the path that `write` returns. Raises as they do."""
     if config.name is not None and config.name.startswith(TRAIN):

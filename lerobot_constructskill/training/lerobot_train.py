@@ -33,7 +33,7 @@ BAR = re.compile(r"\d+%\|")
 
 
 class LeRobotTrainer(Trainer):
-    """`lerobot-train`, for as many passes over the same demonstrations as the study says."""
+    """`lerobot-train`, for as many epochs of the same demonstrations as the study says."""
 
     packages = ("torchvision", "torchcodec", "transformers", "diffusers")
 

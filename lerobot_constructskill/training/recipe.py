@@ -13,7 +13,7 @@ class Training:
     """How a policy is trained on demonstrations. Learning rate and weight decay are the policy's.
 
     Args:
-        epochs: passes over the demonstrations that are not held out.
+        epochs: times that it sees each of the demonstrations that are not held out.
         batch_size: frames per step.
         holdout: every holdout-th demonstration is held out.
 

@@ -40,7 +40,7 @@ def train_seeds(
     policies share one backbone. Where the readout learns, each step holds tens of megabytes of patches per seed.
 
     Args:
-        epochs: passes over the episodes that are not held out.
+        epochs: times that each frame that is not held out is seen.
         batch_size: frames per step and seed.
         held_out: numbers of the episodes that are.
 
