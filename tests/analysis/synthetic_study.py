@@ -17,7 +17,10 @@ HOSTILE = "</style><script>alert('x')</script> | *żółć* `$\\frac$` 煉瓦 \"
 
 STUDY = {
     "name": "synthetic",
-    "settings": {"fixed": {"data": "fast"}, "moved": {"data": "fast"}},
+    "settings": {
+        "fixed": {"data": "fast", "env": {"task": "brick_to_bin"}},
+        "moved": {"data": "fast", "env": {"task": "brick_to_bin_shifted"}},
+    },
     "variants": {
         "dinov2": {"seeds": 10},
         "clip": {"seeds": 10},
@@ -47,7 +50,7 @@ STUDY = {
 
 SMALL = {
     "name": "small",
-    "settings": {"fixed": {"data": "fast"}},
+    "settings": {"fixed": {"data": "fast", "env": {"task": "brick_to_bin"}}},
     "variants": {"one": {"seeds": 2}, "two": {"seeds": 2}},
     "references": {},
     "episodes": 2,

@@ -21,7 +21,16 @@ from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wron
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
-from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, ROWS, STUDY, check_folder, read_rows
+from lerobot_constructskill.presets import names
+from lerobot_constructskill.study.rows import (
+    KNOWN,
+    PROVENANCE,
+    ROWS,
+    STUDY,
+    check_folder,
+    read_environments,
+    read_rows,
+)
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -62,6 +71,8 @@ def write_report(root: Path) -> Path:
     figures.write_figures(findings, root / "figures")
     context = {
         "name": name,
+        "file": name if name in names("study") else STUDY,
+        "tasks": {setting: env["task"] for setting, env in read_environments(root).items()},
         "study": read_text(root / STUDY),
         "findings": findings,
         "films": partial(films, root, rows),
@@ -107,7 +118,7 @@ def provenance(root: Path, rows: pd.DataFrame) -> list[tuple[str, str]]:
     facts = []
     for column, title in COLUMNS.items():
         if len(values := sorted(rows[column].dropna().unique())):
-            many = f"{len(values)} different, as in rows.parquet"
+            many = f"{len(values)} different, in the column {column} of {ROWS}"
             facts.append((title, ", ".join(values) if len(values) <= SHOWN else many))
     versions = pd.DataFrame([json.loads(text) for text in rows["versions"].dropna().unique()])
     facts += [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
