@@ -29,7 +29,6 @@ def parse[Config](
     config_class: type[Config],
     flags: Sequence[str],
     config_path: Path | str | None = None,
-    epilog: str | None = None,
 ) -> Config:
     """Read a configuration from flags, and from a YAML file that they are put over.
 
@@ -38,7 +37,7 @@ def parse[Config](
         MissingError: there is no such file, or a `!policy` in it names no shipped policy.
     """
     with as_input():
-        return Parser(config_class, config_path, exit_on_error=False, epilog=epilog).parse_args(flags)
+        return Parser(config_class, config_path, exit_on_error=False).parse_args(flags)
 
 
 def parse_named[Config](config_class: type[Config], kind: str, text: str, flags: Sequence[str] = ()) -> Config:
@@ -64,12 +63,12 @@ class Parser(ArgumentParser):
     def _postprocessing(self, flags: argparse.Namespace) -> Any:
         texts = {"config_path": self.config_path} | vars(flags)
         path = texts.pop("config_path")
-        said = {name: _value(text, _kind_of(self.config_class, name)) for name, text in texts.items()}
+        said = {name: _value(text, kind_of(self.config_class, name)) for name, text in texts.items()}
         read = {} if path is None else read_fields(Path(path))
         return decode(self.config_class, mergedeep.merge(read, draccus.utils.deflatten(said, sep=".")))
 
 
-def _kind_of(config_class: type, name: str) -> Any:
+def kind_of(config_class: type, name: str) -> Any:
     """The annotation of a field that a flag names, `noise.sigma` for instance."""
     kind: Any = config_class
     for part in name.split("."):
@@ -135,13 +134,6 @@ def read_fields(path: Path) -> dict[str, Any]:
     return (JSON if path.suffix == ".json" else YAML).read(path)
 
 
-def with_fields_of_bases[Config](config_class: type[Config]) -> type[Config]:
-    """Decorate a configuration so that its `--help` tells of the fields of its bases too, which draccus leaves out."""
-    told = [(base.__doc__ or "").partition("Args:\n")[2].partition("\n\n")[0] for base in config_class.__bases__]
-    config_class.__doc__ = "\n".join([(config_class.__doc__ or "").rstrip(), *filter(None, map(str.rstrip, told)), ""])
-    return config_class
-
-
 def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Config:
     """Make a configuration of plain values.
 
@@ -155,7 +147,7 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
             name, found = ".".join(error.key_path), values
             for part in error.key_path:
                 found = found.get(part) if isinstance(found, Mapping) else None
-            if allows(kind := _kind_of(config_class, name), found):
+            if allows(kind := kind_of(config_class, name), found):
                 raise
             raise InputError(refusal(name, kind, found)) from None
         check_same(made, values)

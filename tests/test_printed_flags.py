@@ -35,7 +35,17 @@ STAND_INS = {
 }
 """What a reader puts into a command, and what is put there here."""
 
-PRINTED = sorted({command for page in PAGES for command in [*commands(page), *spans(page)]})
+
+def entry_point(name: str) -> Callable[[], None]:
+    return EntryPoint(name, OURS[name], "console_scripts").load()
+
+
+def examples() -> list[str]:
+    """Those that `--help` prints; the doctor, which has no configuration, prints none."""
+    return [entry_point(name).args[2] for name in OURS if name != "constructskill-doctor"]
+
+
+PRINTED = sorted({command for page in PAGES for command in [*commands(page), *spans(page)]} | {*examples()})
 KNOWN = [command for command in PRINTED if command.split()[0] in OURS | THEIRS]
 
 
@@ -73,10 +83,6 @@ def configured(call: str, folder: Path) -> str:
         return str(find(kind, name))
     assert [flag.partition("=")[0] for flag in flags] == ["--root"]
     return str(write(ConfigConfig(f"train/{name}", write_metadata(folder / "set", [100] * 9))))
-
-
-def entry_point(name: str) -> Callable[[], None]:
-    return EntryPoint(name, OURS[name], "console_scripts").load()
 
 
 @pytest.mark.parametrize("command", [one for one in KNOWN if one.split()[0] in OURS])

@@ -18,7 +18,7 @@ class BoardConfig(Checked):
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 
 
-@command()
+@command("constructskill-board --root=board")
 def board(config: BoardConfig) -> str:
     """Write the board and say where it is.
 

@@ -21,7 +21,7 @@ FAILED = 3
 
 @dataclass
 class CompareConfig(Checked):
-    """Compare two policies by their training seeds: constructskill-compare A B [flags].
+    """Compare two policies by their training seeds.
 
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
     seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
@@ -67,7 +67,10 @@ class CompareConfig(Checked):
         return {name: value for name, value in asdict(self).items() if name in names and value is not None}
 
 
-@command(first=("a", "b"))
+@command(
+    "constructskill-compare 'outputs/mine/train/seed_*' results/fresh_starts:shifted/wrist_state_hidden",
+    first=("a", "b"),
+)
 def compare(config: CompareConfig) -> str:
     """Compare the sides and return the text to print.
 

@@ -19,7 +19,7 @@ from lerobot_constructskill.errors import (
     keep_traceback,
     remedy_of,
 )
-from lerobot_constructskill.presets import find, names
+from lerobot_constructskill.presets import find
 
 REFUSED, FAULT, INTERRUPTED = 1, os.EX_SOFTWARE, 130
 """Exit statuses: something the user can fix; a fault of this package; Ctrl-C."""
@@ -28,7 +28,7 @@ LONGEST = 2000
 """Largest number of characters of a sentence; the log has all of it."""
 
 DEBUG = "--debug"
-EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong; a log in ~/.local/state/constructskill always has it."
+EPILOG = f"{DEBUG} prints the traceback of whatever goes wrong. A log in ~/.local/state/constructskill always has it."
 
 
 class Parser(argparse.ArgumentParser):
@@ -41,33 +41,37 @@ class Parser(argparse.ArgumentParser):
 def run[Config](
     config_class: type[Config],
     action: Callable[[Config], str],
+    example: str,
     presets: str | None = None,
     first: Sequence[str] = (),
 ) -> None:
     """Parse `config_class` from the command line and print what `action` returns, inside `edge`.
 
     Where `presets` is a kind of shipped configurations, one of them, or a file, can stand before all flags. `first`
-    are fields whose values can stand there, in this order and without their names.
+    are fields whose values can stand there, in this order and without their names. `example` is a line of `--help`.
     """
     with edge():
-        from lerobot_constructskill.parsing import parse
+        if {"-h", "--help"} & {*sys.argv[1:]}:
+            from lerobot_constructskill.scripts.usage import help_of
 
-        shipped = ", ".join(names(presets)) if presets else ""
-        told = f"Instead of --config_path, the first argument can be a file or a name: {shipped}. "
-        flags = _name_values(sys.argv[1:], ("config_path",) if presets else first, presets)
-        say(action(parse(config_class, flags, epilog=(told if presets else "") + EPILOG)))
+            say(help_of(config_class, Path(sys.argv[0]).name, example, presets, first, EPILOG).rstrip())
+        else:
+            from lerobot_constructskill.parsing import parse
+
+            flags = _name_values(sys.argv[1:], ("config_path",) if presets else first, presets)
+            say(action(parse(config_class, flags)))
 
 
 def command[Config](
-    presets: str | None = None, first: Sequence[str] = ()
+    example: str, presets: str | None = None, first: Sequence[str] = ()
 ) -> Callable[[Callable[[Config], str]], Callable[[Config], str]]:
     """Give a function that takes a configuration, its argument `config`, a `main` that is its console command.
 
-    `presets` and `first` are those of `run`.
+    `example`, `presets` and `first` are those of `run`.
     """
 
     def with_main(action: Callable[[Config], str]) -> Callable[[Config], str]:
-        action.main = partial(run, get_type_hints(action)["config"], action, presets, first)
+        action.main = partial(run, get_type_hints(action)["config"], action, example, presets, first)
         return action
 
     return with_main

@@ -7,7 +7,7 @@ from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import command, say
 
 
-@command(presets="dagger")
+@command("constructskill-dagger smoke --rounds=2", presets="dagger")
 def dagger(config: DaggerConfig) -> str:
     """Run DAgger, print a line for each policy, and return where the data set and the checkpoint are.
 

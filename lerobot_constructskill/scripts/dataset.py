@@ -33,7 +33,7 @@ class CheckConfig(Checked):
         return open_dataset(locate(self.repo_id, self.root, self.revision))
 
 
-@command()
+@command("constructskill-check --root=outputs/fast")
 def check_dataset(config: CheckConfig) -> str:
     """Print a line for each check and return the verdict.
 
@@ -62,7 +62,7 @@ class CardConfig(Checked):
     facts: Path | None = None  # also write the card's facts as JSON here
 
 
-@command()
+@command("constructskill-card --root=outputs/fast")
 def write_card(config: CardConfig) -> str:
     """Write the card and return a line that says where.
 
@@ -98,7 +98,7 @@ class PushConfig(Checked):
     update: bool = False  # replace a data set that is there already
 
 
-@command()
+@command("constructskill-push --repo_id=user/name --root=outputs/fast --tag=v1")
 def push_dataset(config: PushConfig) -> str:
     """Push and return the commit's address.
 
@@ -130,7 +130,7 @@ class ReplayConfig(CheckConfig):
     episodes: Episodes | None = None  # which to replay; default: all
 
 
-@command()
+@command("constructskill-replay --root=outputs/fast --episodes='[0, 1]'")
 def replay_dataset(config: ReplayConfig) -> str:
     """Replay and return the verdict.
 

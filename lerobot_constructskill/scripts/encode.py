@@ -78,6 +78,6 @@ def encode(config: EncodeConfig) -> Path:
     return out_root
 
 
-@command()
+@command("constructskill-encode --repo_id=local/fast --root=outputs/fast --out_root=outputs/fast_features")
 def tell_encode(config: EncodeConfig) -> str:
     return f"Feature set written to {encode(config)}"

@@ -12,7 +12,6 @@ from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.parsing import with_fields_of_bases
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.scripts.console import command
 
@@ -20,7 +19,6 @@ REQUIRED = 0.95
 """Share of random initial states in which an expert must succeed."""
 
 
-@with_fields_of_bases
 @dataclass(frozen=True)
 class NoNoise(NoiseConfig):
     """`NoiseConfig` for commands that add no noise by default; draccus takes no default from a field's value.
@@ -53,7 +51,7 @@ class FilmConfig(Checked):
             raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
 
-@command()
+@command("constructskill-film --task=brick_on_brick")
 def film(config: FilmConfig) -> str:
     """Write the video and return a line that says where, and how the episode ended.
 
@@ -90,7 +88,7 @@ class CheckTaskConfig(Checked):
     expert: ExpertConfig = field(default_factory=ExpertConfig)
 
 
-@command()
+@command("constructskill-check-task --task=brick_on_brick --states=20")
 def check_task(config: CheckTaskConfig) -> str:
     """Measure the expert and return the outcome in a sentence.
 

@@ -62,7 +62,10 @@ TYPES = {
 """Types of columns in which a value can be missing."""
 
 
-@command()
+@command(
+    "constructskill-offline --repo_id=local/fast --root=outputs/fast "
+    "--policies='outputs/train/*/checkpoints/last/pretrained_model'"
+)
 def evaluate_offline(config: OfflineConfig) -> str:
     """Evaluate every checkpoint, write the files and return the table.
 
@@ -146,7 +149,10 @@ class FitNoiseConfig(HeldOutConfig):
     out: Path  # YAML to write, for constructskill-generate
 
 
-@command()
+@command(
+    "constructskill-fit-noise --repo_id=local/fast --root=outputs/fast "
+    "--policy_path=outputs/train/seed_0/checkpoints/last/pretrained_model --out=outputs/dart_1.yaml"
+)
 def fit_noise(config: FitNoiseConfig) -> str:
     """Fit, write `config.out` and return a line that says what came out.
 

@@ -30,7 +30,10 @@ class PushPolicyConfig(Checked):
     private: bool = False  # whether only its owner sees it
 
 
-@command()
+@command(
+    "constructskill-push-policy --policy_path=outputs/train/seed_0/checkpoints/last/pretrained_model "
+    "--evaluations=outputs/eval --repo_id=user/name --task=brick_to_bin_shifted"
+)
 def push_policy(config: PushPolicyConfig) -> str:
     """Push and return the name.
 

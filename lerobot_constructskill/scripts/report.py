@@ -30,6 +30,6 @@ def report(config: ReportConfig) -> Path:
     return write_report(config.root)
 
 
-@command()
+@command("constructskill-report --root=outputs/study/smoke")
 def tell_report(config: ReportConfig) -> str:
     return f"Report written to {report(config)}"

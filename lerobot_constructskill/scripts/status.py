@@ -18,7 +18,7 @@ class StatusConfig:
     root: Path = Path("outputs/store")
 
 
-@command()
+@command("constructskill-status --root=outputs/store")
 def status(config: StatusConfig) -> str:
     """A line for each folder that other code has made, and one for all.
 

@@ -6,12 +6,10 @@ from pathlib import Path
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.bounds import Count
 from lerobot_constructskill.errors import InputError, plural
-from lerobot_constructskill.parsing import with_fields_of_bases
 from lerobot_constructskill.scripts.console import command
 from lerobot_constructskill.study.spec import Options, Study
 
 
-@with_fields_of_bases
 @dataclass(frozen=True)
 class StudyConfig(Options, Study):
     """Make what is missing of a study and keep what exists; after a kill the same command continues.
@@ -48,7 +46,7 @@ class StudyConfig(Options, Study):
         return replace(study, variants=variants, references=references)
 
 
-@command(presets="study")
+@command("constructskill-study smoke --seeds=2", presets="study")
 def study(config: StudyConfig) -> str:
     """Run a study, or look at one, and return a line about it.
 

@@ -42,7 +42,7 @@ class SubmitConfig:
             raise InputError(f"failures must map training seeds to reasons, not '{bad[0][:100]}'.")
 
 
-@command()
+@command("constructskill-submit --suite=bins --about=about.yaml --recorded=recorded --root=outputs/submission")
 def submit(config: SubmitConfig) -> str:
     """Write a submission and say what is in it.
 

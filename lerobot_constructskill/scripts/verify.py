@@ -31,7 +31,7 @@ class VerifyConfig:
             raise InputError("A verdict is about all episodes: --record cannot be combined with --sample.")
 
 
-@command()
+@command("constructskill-verify --root=board/entries/NAME --sample=20")
 def verify(config: VerifyConfig) -> str:
     """Verify a submission and return the verdict.
 

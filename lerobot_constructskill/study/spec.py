@@ -86,7 +86,7 @@ class Study:
         name: what the study is called.
         settings: name to setting.
         variants: name to variant.
-        references: floors and ceilings to run in every setting, to the number of their seeds.
+        references: what to run beside the variants in every setting, such as `expert`, to the number of seeds.
         training: the recipe.
         demonstrations: `shared`: the training seeds of a variant learn from the same data set, and differ in the
             initial weights and the order of the frames. `own`: each learns from a draw of its own, so that they differ
