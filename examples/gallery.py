@@ -1,10 +1,12 @@
-"""A picture and a film of every task of the contract: `gallery.py [PICTURES FILMS]` writes TASK.jpg and TASK.mp4.
+"""A picture and a film of every task of the contract, or of those that are named: `gallery.py [TASK ...]`.
 
-The picture: left what the policy sees at the start, then close-ups of the scripted expert, half-way and at the end.
-The film: the same demonstration, what the policy sees beside the close-up.
+They go to examples/pictures/TASK.jpg and docs/films/TASK.mp4. The picture: left what the policy sees at the start,
+then close-ups of the scripted expert, half-way and at the end. The film: the same demonstration, what the policy sees
+beside the close-up.
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,16 +20,17 @@ from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.lerobot_internals import write_video
 
+ROOT = Path(__file__).parents[1]
 SIDE = 224
 
 
-def main(pictures: str = "examples/pictures", films: str = "docs/films") -> None:
-    for task in tqdm(SHIPPED.values()):
+def main(names: Sequence[str]) -> None:
+    for task in tqdm([SHIPPED[name] for name in names or SHIPPED]):
         seen, close_ups = demonstration(task)
         tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])
-        Image.fromarray(beside(*tiles)).save(Path(pictures) / f"{task.name}.jpg", quality=85)
+        Image.fromarray(beside(*tiles)).save(ROOT / "examples" / "pictures" / f"{task.name}.jpg", quality=85)
         pairs = zip(seen, close_ups, strict=True)
-        write_video(Path(films) / f"{task.name}.mp4", [beside(*pair) for pair in pairs], FPS)
+        write_video(ROOT / "docs" / "films" / f"{task.name}.mp4", [beside(*pair) for pair in pairs], FPS)
 
 
 def demonstration(task: Task) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -50,4 +53,4 @@ def beside(*images: np.ndarray) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1:])
