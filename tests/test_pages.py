@@ -56,9 +56,7 @@ def test_every_axis_has_its_row_with_its_levels(axis):
 def test_every_shipped_task_has_its_row_picture_limits_and_film(task):
     text, _, limits = (ROOT / "docs" / "tasks.md").read_text().partition("## Known limits")
     lacking = [part for part, rows in {"tasks": text, "known limits": limits}.items() if f"| `{task}` |" not in rows]
-    assert not lacking, (
-        f"docs/tasks.md lacks a row of {task} among {lacking}: see the end of docs/new_task.md"
-    )
+    assert not lacking, f"docs/tasks.md lacks a row of {task} among {lacking}: see the end of docs/new_task.md"
     assert f"({Path('..') / 'examples' / 'pictures' / task}.jpg)" in text
     assert (ROOT / "docs" / "films" / f"{task}.mp4").stat().st_size < 200_000
 
