@@ -1,53 +1,69 @@
-"""Steps/s of sharp keypoints, forward and back, while all threads flush denormal numbers, as in a study.
+"""Keypoints in training: steps/s of the readout, forward and back, and batches/s that a loader reads.
 
-Against it: the first thread alone flushes, because torch made the others before; and none does, as in `lerobot-train`.
-They take turns, each in a process of its own. Maps are random, and patterns as sharp as those that 30 epochs of
-`precise.yaml` leave: 3 % of the softmax is denormal.
+The readout stands against its formula written out in PyTorch, on batches as `precise.yaml` has them, with the threads
+that torch takes and with one, as in a study. Denormal numbers are flushed on both sides. Batches of 64 frames of
+features stand against LeRobot's reading, frame by frame, in one process. All take turns.
 """
 
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from collections.abc import Callable
 
-from measure import report
+import torch
+from lerobot.datasets import LeRobotDataset
+from measure import OUT, report
+from torch import Tensor
 
-TURNS, STEPS = 3, 20
+from lerobot_constructskill.policies.frozen_vit.batches import read_whole_batches
+from lerobot_constructskill.policies.frozen_vit.readouts import SpatialSoftmax, _expected_positions
+
+TURNS = 20
 BATCH, PATCHES, DIM = 64, 784, 152
-SHARPNESS = 1.35
-ALL, FIRST, NONE = "all threads flush", "the first of the threads alone flushes", "no thread flushes"
-
-
-def steps_a_second(flushing: str) -> float:
-    """Steps of one batch in this process, with as many threads as torch takes."""
-    import torch
-
-    from lerobot_constructskill.policies.frozen_vit.readouts import SpatialSoftmax
-    from lerobot_constructskill.training.trainers import flush_denormals
-
-    if flushing == ALL:
-        flush_denormals()
-    torch.ones(1_000_000).add(1)  # makes the other threads
-    if flushing == FIRST:
-        flush_denormals()
-    torch.manual_seed(0)
-    patches, readout = torch.randn(BATCH, PATCHES, DIM), SpatialSoftmax(DIM)
-    torch.nn.init.normal_(readout.patterns.weight, std=SHARPNESS)
-    gradient = 1e-3 * torch.randn(BATCH, 2 * readout.patterns.out_features)
-    readout(patches).backward(gradient)
-    start = time.perf_counter()
-    for _ in range(STEPS):
-        readout(patches).backward(gradient)
-    return STEPS / (time.perf_counter() - start)
 
 
 def main() -> None:
-    rates = {ALL: 0.0, FIRST: 0.0, NONE: 0.0}
-    for _ in range(TURNS):
-        for flushing in rates:
-            with ProcessPoolExecutor(1, get_context("spawn")) as worker:
-                rates[flushing] += worker.submit(steps_a_second, flushing).result() / TURNS
-    for other in (FIRST, NONE):
-        report(f"training steps/s of sharp keypoints, {ALL}", rates[ALL], other, rates[other])
+    torch.set_flush_denormal(True)
+    readouts()
+    batches()
+
+
+def readouts() -> None:
+    torch.manual_seed(0)
+    patches, readout = torch.randn(BATCH, PATCHES, DIM).half(), SpatialSoftmax(DIM)
+    gradient = 1e-3 * torch.randn(BATCH, 2 * readout.patterns.out_features)
+
+    def step(positions: Callable[[], Tensor]) -> None:
+        positions().backward(gradient)
+
+    def formula() -> Tensor:
+        return _expected_positions(readout.patterns(patches.float()))
+
+    threads = torch.get_num_threads()
+    for number in dict.fromkeys((threads, 1)):
+        torch.set_num_threads(number)
+        ours, theirs = in_turns(lambda: step(lambda: readout(patches)), lambda: step(formula))
+        what = "training steps/s of keypoints, " + ("one thread" if number == 1 else f"{number} threads")
+        report(what, ours, "the formula in PyTorch", theirs)
+    torch.set_num_threads(threads)
+
+
+def batches() -> None:
+    chunks = {"action": [step / 20 for step in range(8)]}
+    data = LeRobotDataset("local/fast", root=OUT / "features", delta_timestamps=chunks)
+    read_whole_batches()
+    rows = torch.randperm(len(data))[:BATCH].tolist()
+    ours, theirs = in_turns(lambda: data.__getitems__(rows), lambda: [data[row] for row in rows])
+    report("batches of 64 frames of features read per second", ours, "LeRobot, frame by frame", theirs)
+
+
+def in_turns(ours: Callable[[], object], theirs: Callable[[], object]) -> list[float]:
+    """Calls per second of each."""
+    seconds = [0.0, 0.0]
+    for turn in range(TURNS + 1):
+        for side, call in enumerate((ours, theirs)):
+            start = time.perf_counter()
+            call()
+            seconds[side] += (time.perf_counter() - start) * (turn > 0)  # the first is no measurement
+    return [TURNS / each for each in seconds]
 
 
 if __name__ == "__main__":

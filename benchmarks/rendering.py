@@ -5,7 +5,7 @@ Also ours as a Gymnasium environment with one of its two cameras rendered, and w
 Ours are stepped through LeRobot's vector environment, PickCube-v1 as its users step it. All take turns, a block
 of steps each, so that a change of the machine's load meets all of them; each is measured by the clock and in CPU time,
 which a busy machine disturbs less. Both with lavapipe's own number of threads and with one, each in its own process.
-PyTorch gets one thread: the simulator's tensors are tiny, and waking a second one for them costs more than it gives.
+PyTorch has the threads that it takes by itself.
 """
 
 import os
@@ -14,7 +14,6 @@ import sys
 
 import gymnasium as gym
 import numpy as np
-import torch
 from measure import CpuTimer, Timer, report
 
 from lerobot_constructskill.contract import IMAGE_SIZE
@@ -60,7 +59,6 @@ def of_two_cameras(cameras: tuple[str, ...]):
 
 
 def measure(threads: str) -> None:
-    torch.set_num_threads(1)
     steps = {"ours": ours(True), "original meshes": ours(False), "PickCube-v1": pick_cube()}
     steps |= {"one camera": of_two_cameras(("wrist",)), "two cameras": of_two_cameras(("base", "wrist"))}
     timers = {name: (Timer(), CpuTimer()) for name in steps}

@@ -1,13 +1,20 @@
 """Lift and place counts per training seed, from what LeRobot's scripts wrote: `count_outcomes.py FOLDER`.
 
 Reads FOLDER/eval/seed_*/eval_info.json (the reward of a step is the stage reached, so an episode's largest reward
-tells whether it lifted and placed) and the held-out loss in FOLDER/train_*.log.
+tells whether it lifted and placed) and the held-out loss in FOLDER/train_*.log. The films of a seed's episodes go into
+FOLDER/seed_N.mp4, side by side.
 """
 
 import re
 import sys
+from itertools import zip_longest
 from pathlib import Path
 
+import av
+import numpy as np
+
+from lerobot_constructskill.contract import FPS
+from lerobot_constructskill.lerobot_internals import write_video
 from lerobot_constructskill.scripts.push_policy import seed_outcomes
 
 
@@ -19,8 +26,26 @@ def main(folder: Path) -> None:
         print(f"| {seed} | {lifted}/{episodes} | {placed}/{episodes} | {loss} |")
     lifted_seeds, placed_seeds = (sum(outcome[i] > 0 for outcome in outcomes) for i in (1, 2))
     print(f"\nSeeds that lifted: {lifted_seeds} of {len(outcomes)}; that placed: {placed_seeds} of {len(outcomes)}.")
-    videos = sorted(folder.glob("eval/seed_*/videos/**/*.mp4"))
-    print("Videos:", *videos, sep="\n  ")
+    films = [side_by_side(folder, seed) for seed, *_ in outcomes]
+    print("The episodes of a seed side by side:", *films, sep="\n  ")
+
+
+def side_by_side(folder: Path, seed: int) -> Path:
+    """Write the films of a seed's episodes into one; an episode that has ended stands still."""
+    columns = [frames(path) for path in sorted(folder.glob(f"eval/seed_{seed}/videos/**/*.mp4"))]
+    rows = zip_longest(*columns)
+    shown = [column[0] for column in columns]
+    pictures = []
+    for row in rows:
+        shown = [last if new is None else new for new, last in zip(row, shown, strict=True)]
+        pictures.append(np.concatenate(shown, axis=1))
+    write_video(film := folder / f"seed_{seed}.mp4", pictures, FPS)
+    return film
+
+
+def frames(film: Path) -> list[np.ndarray]:
+    with av.open(film) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
 if __name__ == "__main__":

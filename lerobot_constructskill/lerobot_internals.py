@@ -24,9 +24,11 @@ NAMES = {
     # Statistics and files of data sets, read and written as LeRobot does it.
     "compute_episode_stats": "lerobot.datasets.compute_stats",
     "decode_video_frames": "lerobot.datasets.video_utils",
+    "embed_images": "lerobot.datasets.dataset_writer",
     "load_episodes": "lerobot.datasets.dataset_metadata",
     "load_info": "lerobot.datasets.io_utils",
     "load_stats": "lerobot.datasets.io_utils",
+    "RunningQuantileStats": "lerobot.datasets.compute_stats",
     "write_video": "lerobot.utils.io_utils",
     # Where LeRobot keeps data sets, its own and those from the Hub.
     "HF_LEROBOT_HOME": "lerobot.utils.constants",

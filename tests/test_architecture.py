@@ -14,14 +14,15 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 SIMULATOR = {"sapien", "mani_skill", "mplib"}
 
 # What a room, or a file with a row of its own, may import of ours, a room or a file of one; its own room and
-# these five go without saying.
-EVERYWHERE = ("bounds", "errors", "files", "lerobot_internals", "progress")
+# these six go without saying.
+EVERYWHERE = ("bounds", "errors", "files", "lerobot_internals", "progress", "threads")
 ARROWS = {
     "bounds": (),
     "errors": (),
     "files": (),
     "lerobot_internals": (),
     "progress": (),
+    "threads": (),
     "presets": (),
     "parsing": ("presets",),
     "policy_types": ("parsing",),
@@ -115,6 +116,7 @@ EXTERNALS = {
     "files": {"pyarrow", "pydantic", "yaml"},
     "lerobot_internals": set(),
     "progress": {"av", "tqdm"},
+    "threads": {"torch"},
     "other_tasks": set(),
     "contract": set(),
     "cameras": {"numpy"},

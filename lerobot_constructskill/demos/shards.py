@@ -13,6 +13,7 @@ from lerobot_constructskill.contract import FPS, Task, get_task
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import make_expert
+from lerobot_constructskill.demos.pixels import running_statistics
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
@@ -109,8 +110,15 @@ def write_episode(
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 
+    from lerobot_constructskill.lerobot_internals import patched
+
     os.environ.setdefault("SVT_LOG", "1")
-    with quiet():
+    # There are videos and no pictures to embed, for which LeRobot would go through all rows one by one.
+    no_pictures, counted = (
+        patched("embed_images", lambda rows: rows),
+        patched("RunningQuantileStats", running_statistics()),
+    )
+    with quiet(), no_pictures, counted:
         dataset = LeRobotDataset.create(
             repo_id=repo_id,
             root=root,

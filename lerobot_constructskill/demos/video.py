@@ -23,6 +23,9 @@ ONE_THREAD = "pools=none:frame-threads=1:info=0"
 CLOSED_GROUPS = "open-gop=0"
 """By default x265 lets frames refer to a later key frame; LeRobot's default decoder cannot read these at random."""
 
+SMALL_BLOCKS = "ctu=16:rd=1"
+"""Six tenths of the time of x265's fastest preset, and 2 % more bytes: blocks of 16 pixels, less often tried."""
+
 VIDEOS = {
     "av1": Video(3_000, {"crf": 18}),
     "lossless": Video(
@@ -33,7 +36,7 @@ VIDEOS = {
             "crf": None,
             "g": 10,
             "preset": "ultrafast",
-            "extra_options": {"x265-params": f"lossless=1:log-level=none:{ONE_THREAD}:{CLOSED_GROUPS}"},
+            "extra_options": {"x265-params": f"lossless=1:{SMALL_BLOCKS}:log-level=none:{ONE_THREAD}:{CLOSED_GROUPS}"},
         },
     ),
 }

@@ -27,6 +27,7 @@ from lerobot_constructskill.envs.recording import keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.interface import describe_task
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.threads import one_thread
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
 SEEING = ("auto", "gpu", "cpu")
@@ -127,6 +128,7 @@ class ConstructSkillEnv(gym.Env):
 
     # Gymnasium
 
+    @one_thread()
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -142,6 +144,7 @@ class ConstructSkillEnv(gym.Env):
         self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._settings)
         return self._observation(obs), self._info(info) | {"contract": json.dumps(self.contract)}
 
+    @one_thread()
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance 1/20 s.
 
@@ -158,6 +161,7 @@ class ConstructSkillEnv(gym.Env):
                 self._recording = None
         return self._observation(obs), float(reward[0]), terminated, truncated, info
 
+    @one_thread()
     def render(self) -> np.ndarray:
         """A close-up of the scene, (H, W, 3) uint8. Raises as `step` does."""
         return self.started().render()[0].cpu().numpy()
@@ -174,11 +178,13 @@ class ConstructSkillEnv(gym.Env):
 
     # For experts and recorders
 
+    @one_thread()
     def privileged_state(self) -> dict[str, np.ndarray]:
         """The simulator's state, `contract.SIM_STATE` name to float32 array. Raises as `step` does."""
         state = self.started().privileged_state()
         return {name: value[0].cpu().numpy().astype(np.float32) for name, value in state.items()}
 
+    @one_thread()
     def agent_state(self) -> np.ndarray:
         """Proprioception as `contract.STATE_NAMES` names it, (8,) float32. Raises as `step` does."""
         return self.started().agent_state()[0].cpu().numpy().astype(np.float32)

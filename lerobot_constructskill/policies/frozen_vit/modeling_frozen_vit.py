@@ -19,6 +19,7 @@ from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
+from .batches import Rows, read_whole_batches
 from .configuration_frozen_vit import FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
 from .feature_sets import check_features, describe, open_patches, stated
@@ -79,6 +80,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.encoder_record = self._begin_record(encoder_record)
         spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
+        self._patch_rows = Rows()
         self._check_features(dataset_meta.root if dataset_meta is not None else None)
         if encoder_record is None:
             check_native(config.backbone_precision, config.device)
@@ -209,6 +211,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             check_features(column, made_by, encoder.spec.feature_dim)
             if self.readout.reads_patches:
                 open_patches(root)
+            read_whole_batches()
 
     def _check_data_set(self, meta: Any) -> None:
         """Refuse a data set of another rate, or without the points that the readout learns to find."""
@@ -312,8 +315,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             cls = batch[self.config.feature_key].float()
             if not self.readout.reads_patches:
                 return cls
-            patches = open_patches(self.patches_root)[batch["index"].cpu()]  # (B, N, D) float16
-            return self.readout.pool(cls, patches.to(cls))
+            patches = self._patch_rows.read(open_patches(self.patches_root), batch["index"]).to(cls.device)
+            return self.readout.pool(cls, patches if self.readout.learns else patches.to(cls))
         if self.config.image_key in batch:
             return self.pool(batch[self.config.image_key])
         raise InputError(

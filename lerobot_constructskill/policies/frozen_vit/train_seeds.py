@@ -19,7 +19,9 @@ from torch.func import functional_call, stack_module_state, vmap
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.progress import Progress
+from lerobot_constructskill.threads import one_thread
 
+from .batches import Rows
 from .configuration_frozen_vit import FrozenViTChunkConfig
 from .feature_sets import open_patches
 from .heads import ChunkHeads, heads_loss
@@ -62,12 +64,8 @@ def train_seeds(
     heads = [_fresh_heads(template, seed) for seed in seeds]
     n_steps = epochs * -(-len(rows) // batch_size)
     batches = Progress(_batches(rows, seeds, epochs, batch_size), f"training {len(seeds)} seeds", n_steps, unit="step")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         _step_together(heads, template.config, inputs, table, batches, n_steps)
-    finally:
-        torch.set_num_threads(threads)
     return [with_heads(template, its_heads) for its_heads in heads]
 
 
@@ -145,10 +143,13 @@ def _step_together(
     parameters = {name: nn.Parameter(tensor.detach()) for name, tensor in stacked.items()}
     optimizer = preset.build(list(parameters.values()))
     scheduler = schedule.build(optimizer, n_steps) if schedule else None
-    columns = [_Column(values, config.device) for values in inputs]
+    memories = [Rows() for _ in inputs]
     for batch in batches:
         wanted = [label[batch] for label in labels]
-        seen = [column.read(batch) for column in columns]
+        seen = [
+            memory.read(values, batch.flatten()).unflatten(0, batch.shape).to(config.device)
+            for memory, values in zip(memories, inputs, strict=True)
+        ]
         made = vmap(lambda own, *seen: functional_call(heads[0], own, seen))(parameters, *seen)
         losses, _ = vmap(partial(heads_loss, config))(*made, *wanted)
         optimizer.zero_grad()
@@ -159,29 +160,6 @@ def _step_together(
             scheduler.step()
     for number, own in enumerate(heads):
         own.load_state_dict({name: tensor[number] for name, tensor in parameters.items()})
-
-
-class _Column:
-    """A column of what the heads see, whose batches lie in the same memory one after another.
-
-    A batch of patch features is tens of megabytes, and fresh memory for as much in every step costs page faults.
-
-    Args:
-        values: the column, (N, ...).
-        device: where the heads are.
-    """
-
-    def __init__(self, values: Tensor, device: str):
-        self.values = values
-        self.rows = values.new_empty(0)
-        self.batch = torch.empty(0, device=device)
-
-    def read(self, batch: Tensor) -> Tensor:
-        """Return the rows (S, B) as (S, B, ...) in float32, until the next batch is read. The first is the largest."""
-        shape = batch.numel(), *self.values.shape[1:]
-        rows, seen = self.rows.resize_(shape), self.batch.resize_(shape)
-        torch.index_select(self.values, 0, batch.flatten().to(self.values.device), out=rows)
-        return seen.copy_(rows).unflatten(0, batch.shape)
 
 
 def _clip_each(parameters: Sequence[Tensor], longest: float) -> None:
