@@ -91,23 +91,22 @@ state, source = load_weights(get_backbone("{name}"))
 print(f"{{source}}, sha256 {{state_sha256(state)[:12]}}")
 """
 
-# Random weights take as long as trained ones. `constructskill-generate fast_shifted_wrist --episodes=50` makes 5,381
-# frames.
+# Random weights take as long as trained ones. The 50 demonstrations of `make demo` have 5,381 frames.
 ENCODE = """
 import time, torch
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.encoder import FrozenEncoder
 from lerobot_constructskill.policies.frozen_vit.precision import native_precision
 device = "cuda" if torch.cuda.is_available() else "cpu"
-encoder = FrozenEncoder(get_backbone("dinov2_vits14"), native_precision(device)).to(device)
+encoder = FrozenEncoder(get_backbone("efficientnet_lite0_fine"), native_precision(device)).to(device)
 images = torch.rand(16, 3, 224, 224)
 for _ in range(2):
     start = time.perf_counter()
     encoder(images.to(device)).cpu()
     speed = 16 / (time.perf_counter() - start)
 print(
-    f"backbone_precision=auto is {encoder.precision} here, {speed:.0f} images/s of dinov2_vits14 by {encoder.runtime} "
-    f"on the {device}: about {5_381 / speed / 60:.0f} min for 50 demonstrations"
+    f"backbone_precision=auto is {encoder.precision} here, {speed:.0f} images/s of efficientnet_lite0_fine by "
+    f"{encoder.runtime} on the {device}: about {5_381 / speed:.0f} s for the 50 demonstrations of make demo"
 )
 """
 
