@@ -26,20 +26,21 @@ def main(folder: Path) -> None:
         print(f"| {seed} | {lifted}/{episodes} | {placed}/{episodes} | {loss} |")
     lifted_seeds, placed_seeds = (sum(outcome[i] > 0 for outcome in outcomes) for i in (1, 2))
     print(f"\nSeeds that lifted: {lifted_seeds} of {len(outcomes)}; that placed: {placed_seeds} of {len(outcomes)}.")
-    films = [side_by_side(folder, seed) for seed, *_ in outcomes]
-    print("The episodes of a seed side by side:", *films, sep="\n  ")
+    films = {seed: sorted(folder.glob(f"eval/seed_{seed}/videos/**/*.mp4")) for seed, *_ in outcomes}
+    made = [side_by_side(its_films, folder / f"seed_{seed}.mp4") for seed, its_films in films.items() if its_films]
+    print("The episodes of a seed side by side:", *made, sep="\n  ")
 
 
-def side_by_side(folder: Path, seed: int) -> Path:
-    """Write the films of a seed's episodes into one; an episode that has ended stands still."""
-    columns = [frames(path) for path in sorted(folder.glob(f"eval/seed_{seed}/videos/**/*.mp4"))]
+def side_by_side(films: list[Path], film: Path) -> Path:
+    """Write films into one; the last picture of a shorter one stays."""
+    columns = [frames(path) for path in films]
     rows = zip_longest(*columns)
     shown = [column[0] for column in columns]
     pictures = []
     for row in rows:
         shown = [last if new is None else new for new, last in zip(row, shown, strict=True)]
         pictures.append(np.concatenate(shown, axis=1))
-    write_video(film := folder / f"seed_{seed}.mp4", pictures, FPS)
+    write_video(film, pictures, FPS)
     return film
 
 

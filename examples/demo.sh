@@ -7,6 +7,11 @@ cd "$(dirname "$0")/.."
 export PATH="$PWD/.venv/bin:$PATH"
 OUT="${OUT:-outputs/demo}" SEEDS="${SEEDS:-0}"
 
+if [ -d "$OUT/features" ] && ! grep -q efficientnet_lite0_fine "$OUT/features/meta/info.json"; then
+    echo "$OUT holds the demo of another recipe: remove it, or name another folder (OUT=...)" >&2
+    exit 1
+fi
+
 trap 'kill $(jobs -p) 2>/dev/null || true' EXIT # what is interrupted leaves nothing running
 
 say() { printf '\n\033[1m== %d:%02d  %s\033[0m\n' $((SECONDS / 60)) $((SECONDS % 60)) "$*"; }

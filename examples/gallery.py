@@ -25,6 +25,8 @@ SIDE = 224
 
 
 def main(names: Sequence[str]) -> None:
+    if unknown := {*names} - {*SHIPPED}:
+        sys.exit(f"There is no shipped task '{min(unknown)}'; the tasks are: {', '.join(SHIPPED)}.")
     for task in tqdm([SHIPPED[name] for name in names or SHIPPED]):
         seen, close_ups = demonstration(task)
         tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])

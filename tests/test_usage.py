@@ -33,8 +33,8 @@ def test_help_has_what_stands_before_the_flags_an_example_and_words_on_each_flag
     config_class, _, example, presets, first = MAINS[name].args
     usage = re.match(rf"usage: {name} (.*)\[--FLAG=VALUE", printed)[1]
     required = {one.name for one in fields(config_class) if one.default is one.default_factory is MISSING}
-    named = [word.lower() if word.lower() in required else word.strip("[]").lower() for word in usage.split()]
-    assert named == (["name"] if presets else [*first])
+    stands = [name.upper() if name in required else f"[{name.upper()}]" for name in first]
+    assert usage.split() == (["[NAME]"] if presets else stands)
     assert f"example: {example}" in printed and name in example
     assert not re.findall(r"^  (--\S+ \S+)\n(?! {26})", printed, re.M), "nothing is said of them"
     told = {flag.partition(".")[0] for flag in re.findall(r"^  --(\S+)", printed, re.M)}

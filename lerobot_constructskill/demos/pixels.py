@@ -25,7 +25,8 @@ def running_statistics() -> type:
             if batch.dtype != np.uint8:
                 super().update(batch)
             else:
-                seen = np.stack([np.bincount(channel, minlength=LEVELS) for channel in batch.T])
+                channels = batch.reshape(-1, batch.shape[-1]).T
+                seen = np.stack([np.bincount(channel, minlength=LEVELS) for channel in channels])
                 self.counts = seen if self.counts is None else self.counts + seen
 
         def get_statistics(self) -> dict[str, np.ndarray]:

@@ -11,7 +11,8 @@ from lerobot_constructskill.scripts.console import command
 class ReportConfig(Checked):
     """Write report.html, report.md and figures/ into a study's folder.
 
-    The folder holds study.yaml, whose section `analysis` says how the rows are read, and rows.parquet. It may hold
+    The folder holds rows.parquet and study.yaml, whose settings say which tasks the rows are of, and whose section
+    `analysis` says how they are read. It may hold
     provenance.json, one JSON object of names and values to show. A study need not be complete.
     """
 

@@ -13,6 +13,7 @@ from typing import Any
 from lerobot_constructskill.parsing import Parser, kind_of
 from lerobot_constructskill.presets import names
 
+NARROWEST = 40
 WIDTH = 100
 """Characters of the longest line, on a screen that has as many."""
 
@@ -34,9 +35,9 @@ def help_of(
     by_name = {field.name: field for field in fields(config_class)}
     positional = [name.upper() if _is_required(by_name[name]) else f"[{name.upper()}]" for name in first]
     parser.prog = command
-    parser.usage = " ".join(["%(prog)s", *(["NAME"] if presets else positional), "[--FLAG=VALUE ...]"])
+    parser.usage = " ".join(["%(prog)s", *(["[NAME]"] if presets else positional), "[--FLAG=VALUE ...]"])
     shipped = f"NAME is a file, or one of: {', '.join(names(presets))}." if presets else ""
-    width = min(WIDTH, shutil.get_terminal_size().columns) - 2
+    width = max(NARROWEST, min(WIDTH, shutil.get_terminal_size().columns) - 2)
     parser.description = f"example: {example}\n\n{_filled(_introduction(config_class), width)}"
     parser.epilog = _filled(f"{shipped}\n\n{end}".strip(), width)
     parser.formatter_class = partial(argparse.RawDescriptionHelpFormatter, max_help_position=26, width=width)
@@ -47,10 +48,10 @@ def help_of(
         for action in group._group_actions:
             name = action.dest.rpartition(".")[2]
             action.metavar = name.upper()
-            action.help = _told(config_class, action, required=not presets and name not in first)
+            action.help = _told(config_class, action, name not in first, presets)
     for action in options._group_actions:
         if action.dest == "config_path":
-            action.help, action.metavar = "a YAML file of these flags; those of the command line go before it", "FILE"
+            action.help, action.metavar = "a YAML file of these flags; flags on the command line override it", "FILE"
         elif action.dest != "help":
             action.help = argparse.SUPPRESS  # draccus' "Config file for noise"
     return parser.format_help()
@@ -65,14 +66,14 @@ def _introduction(config_class: type) -> str:
     return re.split(r"^(?:Args|Raises):\n", cleandoc(config_class.__doc__ or ""), maxsplit=1, flags=re.M)[0].strip()
 
 
-def _told(config_class: type, action: argparse.Action, required: bool) -> str:
+def _told(config_class: type, action: argparse.Action, required: bool, presets: str | None) -> str:
     """What is said of a field: the comment beside it, or its line among `Args:`; and its default."""
     owner, _, name = action.dest.rpartition(".")
     config = _dataclass_of(config_class, owner)
     said = ((action.help or "").strip() or _arguments(config).get(name, "")).rstrip(".")
     field = next(one for one in fields(config) if one.name == name)
     if required and _is_required(field):
-        said += " (required)"
+        said += " (required without NAME)" if presets else " (required)"
     elif "default" not in said and action.default not in (None, MISSING, argparse.SUPPRESS, "", [], (), {}):
         said += f" (default: {str(action.default).lower() if isinstance(action.default, bool) else action.default})"
     return said.strip().replace("%", "%%")

@@ -80,7 +80,7 @@ def test_each_table_has_the_command_that_makes_its_lines_again(study):
     text = " ".join(" ".join(Reader((study / "report.html").read_text()).text).split())
     for setting, task in (("fixed", "brick_to_bin"), ("moved", "brick_to_bin_shifted")):
         command = f"constructskill-study study.yaml --only={setting}/dinov2"
-        assert f"Task {task}. A line of the table is made again by {command}" in text
+        assert f"Task {task}. A line of the table is made again by, in this folder, {command}" in text
     ours = (REPOSITORY / "results" / "fresh_starts" / "report.md").read_text().replace("\\", "")
     assert "<code>constructskill-study fresh_starts --only=shifted/wrist_state_hidden</code>" in ours
 
@@ -404,3 +404,10 @@ def test_command_imports_neither_torch_nor_lerobot_nor_simulator(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [f"Report written to {tmp_path / 'report.html'}", "set()"]
+
+
+def test_rows_of_a_setting_that_the_study_lacks_are_refused(tmp_path):
+    rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, 1, 1)]
+    root = write_study(tmp_path, SMALL | {"settings": {"other": SMALL["settings"]["fixed"]}}, rows)
+    with pytest.raises(InputError, match=r"has no setting 'fixed', which rows in rows\.parquet are of"):
+        report(ReportConfig(root))

@@ -31,9 +31,27 @@ def same(found: dict, wanted: dict) -> None:
 def test_a_batch_from_memory_is_what_lerobot_reads(feature_set, deltas, episodes):
     data = LeRobotDataset("local/random", root=feature_set.root, delta_timestamps=deltas, episodes=episodes)
     rows = random.Random(0).sample(range(len(data)), len(data))
-    for found, row in zip(data.__getitems__(rows), rows, strict=True):
+    frames = data.__getitems__(rows)
+    for found, row in zip(frames, rows, strict=True):
         same(found, data[row])
-    assert _frames[data] is not None
+    assert data in _frames
+    frames[0]["action"].zero_()
+    same(data.__getitems__(rows[:1])[0], data[rows[0]])
+
+
+def test_frames_that_were_selected_since_are_not_those_of_before(feature_set):
+    data = LeRobotDataset("local/random", root=feature_set.root)
+    data.__getitems__([0])
+    data.reader.hf_dataset = data.hf_dataset.select(range(5, 20))
+    same(data.__getitems__([0])[0], data[0])
+
+
+def test_what_a_subclass_adds_to_a_frame_stays(feature_set):
+    class WithMore(LeRobotDataset):
+        def __getitem__(self, index):
+            return super().__getitem__(index) | {"more": index}
+
+    assert WithMore("local/random", root=feature_set.root).__getitems__([3])[0]["more"] == 3
 
 
 def test_a_loader_gives_the_same_batches(feature_set):
@@ -47,7 +65,7 @@ def test_frames_with_videos_are_read_as_before(demonstrations):
     data = LeRobotDataset("local/demos", root=demonstrations)
     for found, row in zip(data.__getitems__([7, 3]), [7, 3], strict=True):
         same(found, data[row])
-    assert _frames[data] is None
+    assert data not in _frames
 
 
 def test_what_lerobot_may_have_some_day_is_left_alone(monkeypatch):

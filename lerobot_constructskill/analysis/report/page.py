@@ -21,7 +21,8 @@ from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wron
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
-from lerobot_constructskill.presets import names
+from lerobot_constructskill.parsing import read_fields
+from lerobot_constructskill.presets import find, names
 from lerobot_constructskill.study.rows import (
     KNOWN,
     PROVENANCE,
@@ -68,11 +69,15 @@ def write_report(root: Path) -> Path:
     """
     name, analysis, rows = read_study(root)
     findings = summarize(analysis, rows)
+    environments = read_environments(root)
+    if unknown := set(rows["setting"]) - set(environments):
+        raise InputError(f"'{root / STUDY}' has no setting '{min(unknown)}', which rows in {ROWS} are of.")
     figures.write_figures(findings, root / "figures")
     context = {
         "name": name,
-        "file": name if name in names("study") else STUDY,
-        "tasks": {setting: env["task"] for setting, env in read_environments(root).items()},
+        "name_of_study": name,
+        "is_shipped": _is_shipped(name, rows),
+        "tasks": {setting: env["task"] for setting, env in environments.items()},
         "study": read_text(root / STUDY),
         "findings": findings,
         "films": partial(films, root, rows),
@@ -124,6 +129,17 @@ def provenance(root: Path, rows: pd.DataFrame) -> list[tuple[str, str]]:
     facts += [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
     others = KNOWN.read(root / PROVENANCE) if (root / PROVENANCE).exists() else {}
     return facts + [(name.replace("_", " "), str(value)) for name, value in others.items()]
+
+
+def _is_shipped(name: str, rows: pd.DataFrame) -> bool:
+    """Whether a study of ours has this name, and all settings and variants of the rows."""
+    if name not in names("study"):
+        return False
+    study = read_fields(find("study", name))
+    return {*rows["setting"]} <= {*study["settings"]} and {*rows["variant"]} <= {
+        *study["variants"],
+        *study.get("references", {}),
+    }
 
 
 def _is_inside(root: Path, video: str) -> bool:

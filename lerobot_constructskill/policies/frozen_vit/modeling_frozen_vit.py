@@ -19,7 +19,7 @@ from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
 
 from .backbones import get_backbone
-from .batches import Rows, read_whole_batches
+from .batches import read_whole_batches
 from .configuration_frozen_vit import FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
 from .feature_sets import check_features, describe, open_patches, stated
@@ -80,7 +80,6 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self.encoder_record = self._begin_record(encoder_record)
         spec = get_backbone(config.backbone, config.backbone_path)
         self.backbone = FrozenEncoder(spec, config.backbone_precision, config.crop, config.blind)
-        self._patch_rows = Rows()
         self._check_features(dataset_meta.root if dataset_meta is not None else None)
         if encoder_record is None:
             check_native(config.backbone_precision, config.device)
@@ -315,7 +314,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             cls = batch[self.config.feature_key].float()
             if not self.readout.reads_patches:
                 return cls
-            patches = self._patch_rows.read(open_patches(self.patches_root), batch["index"]).to(cls.device)
+            rows = batch["index"].cpu()
+            patches = open_patches(self.patches_root).index_select(0, rows).to(cls.device)  # (B, N, D) float16
             return self.readout.pool(cls, patches if self.readout.learns else patches.to(cls))
         if self.config.image_key in batch:
             return self.pool(batch[self.config.image_key])

@@ -24,7 +24,7 @@ CACHED = 8
 """Images whose patches are taken into the processor's cache at a time, a few megabytes."""
 
 NEGLIGIBLE = 1e-12
-"""Share of a map that is as good as none: float32 has seven digits."""
+"""Share of a map that changes no sum: it is far below the 1e-7 of float32."""
 
 POINT_SCALE = 8.0
 """Factor on the positions that `heat_maps` returns: from -1 to 1 the millimetres that count are lost on the heads."""
@@ -99,7 +99,7 @@ class _Positions(torch.autograd.Function):
     def forward(patches: Tensor, patterns: Tensor) -> tuple[Tensor, Tensor]:
         """Return positions (B, 2K) and the softmax of each map (B, K, N), for patches (B, N, D), patterns (K, D)."""
         shares = patterns.new_empty(len(patches), len(patterns), patches.shape[1])
-        for some, its_shares in zip(_in_cache(patches, patterns), shares.split(CACHED), strict=True):
+        for some, its_shares in zip(_in_cache(patches, patterns), shares.split(_group(patches)), strict=True):
             torch.matmul(patterns, some.transpose(1, 2), out=its_shares)
         shares = nn.functional.threshold(shares.softmax(dim=-1), NEGLIGIBLE, 0.0, inplace=True)
         line = _line(patches.shape[1]).to(shares)
@@ -122,7 +122,7 @@ class _Positions(torch.autograd.Function):
         of_maps -= (gradient * positions).sum(dim=-1, keepdim=True)
         of_maps *= shares
         of_patterns = gradient.new_zeros(shares.shape[1], patches.shape[-1])
-        for some, of_its_maps in zip(_in_cache(patches, gradient), of_maps.split(CACHED), strict=True):
+        for some, of_its_maps in zip(_in_cache(patches, gradient), of_maps.split(_group(patches)), strict=True):
             of_patterns += torch.bmm(of_its_maps, some).sum(dim=0)
         return None, of_patterns
 
@@ -138,10 +138,15 @@ class _Positions(torch.autograd.Function):
         return tuple(torch.stack(each) for each in zip(*made, strict=True)), (0, 0)
 
 
+def _group(patches: Tensor) -> int:
+    """Images at a time: all of them on a GPU, which has no cache to fill."""
+    return CACHED if patches.device.type == "cpu" else max(1, len(patches))
+
+
 def _in_cache(patches: Tensor, like: Tensor) -> Iterator[Tensor]:
-    """Yield the patches of a few images at a time, in the type of `like`, until the next are asked for."""
-    cached = like.new_empty(min(CACHED, len(patches)), *patches.shape[1:])
-    for some in patches.split(CACHED):
+    """Yield the patches of a few images at a time, in the type of `like`; the next ones overwrite them."""
+    cached = like.new_empty(min(_group(patches), len(patches)), *patches.shape[1:])
+    for some in patches.split(_group(patches)):
         yield cached[: len(some)].copy_(some)
 
 

@@ -44,7 +44,7 @@ def train_seeds(
     Args:
         epochs: times that each frame that is not held out is seen.
         batch_size: frames per step and seed.
-        held_out: numbers of the episodes that are.
+        held_out: numbers of the held-out episodes.
 
     Raises:
         ValueError: the data set has images in place of features, they are another encoder's, or it does not say where
