@@ -91,7 +91,7 @@ state, source = load_weights(get_backbone("{name}"))
 print(f"{{source}}, sha256 {{state_sha256(state)[:12]}}")
 """
 
-# Random weights take as long as trained ones. The 50 demonstrations of `make demo` have 5,381 frames.
+# Random weights take as long as trained ones. Fifty demonstrations of precise/brick_to_bin_shifted have 5,381 frames.
 ENCODE = """
 import time, torch
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
@@ -106,7 +106,7 @@ for _ in range(2):
     speed = 16 / (time.perf_counter() - start)
 print(
     f"backbone_precision=auto is {encoder.precision} here, {speed:.0f} images/s of efficientnet_lite0_fine by "
-    f"{encoder.runtime} on the {device}: about {5_381 / speed:.0f} s for the 50 demonstrations of make demo"
+    f"{encoder.runtime} on the {device}: about {5_381 / speed:.0f} s for 50 demonstrations"
 )
 """
 
