@@ -7,7 +7,6 @@ import json
 import sys
 from pathlib import Path
 
-import torch
 from run import machine
 
 from lerobot_constructskill.contract import SHIPPED
@@ -17,7 +16,6 @@ FILE = Path(__file__).with_suffix(".json")
 
 
 def main(names: list[str]) -> None:
-    torch.set_num_threads(1)  # the tensors of one environment are too small for more
     counts = json.loads(FILE.read_text()) if FILE.exists() else {}
     for name in names or SHIPPED:
         config = CheckTaskConfig(name)

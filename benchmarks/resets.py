@@ -22,11 +22,8 @@ ALL_OBJECTS = "the garbage collector looks at what was imported"
 
 def seconds_a_reset(spare_imports: bool, render_backend: str) -> float:
     """CPU seconds of a reset and one step, in this process."""
-    import torch
-
     from lerobot_constructskill.envs import gym_env
 
-    torch.set_num_threads(1)
     if not spare_imports:
         gym_env._spare_imports = lambda: None
     env = gym_env.ConstructSkillEnv(

@@ -4,7 +4,6 @@ Usage: python benchmarks/response.py
 """
 
 import numpy as np
-import torch
 from run import machine
 
 from lerobot_constructskill.contract import get_task
@@ -36,7 +35,6 @@ def response(channel: int, asked: float) -> np.ndarray:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
     print(machine())
     for channel, name in enumerate(get_task("brick_to_bin_turned").action_names[:-1]):
         for asked in ASKED[name]:

@@ -7,11 +7,9 @@ FOLDER/seed_N.mp4, side by side.
 
 import re
 import sys
-from itertools import zip_longest
 from pathlib import Path
 
-import av
-import numpy as np
+from films import frames, side_by_side
 
 from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.lerobot_internals import write_video
@@ -27,26 +25,11 @@ def main(folder: Path) -> None:
     lifted_seeds, placed_seeds = (sum(outcome[i] > 0 for outcome in outcomes) for i in (1, 2))
     print(f"\nSeeds that lifted: {lifted_seeds} of {len(outcomes)}; that placed: {placed_seeds} of {len(outcomes)}.")
     films = {seed: sorted(folder.glob(f"eval/seed_{seed}/videos/**/*.mp4")) for seed, *_ in outcomes}
-    made = [side_by_side(its_films, folder / f"seed_{seed}.mp4") for seed, its_films in films.items() if its_films]
-    print("The episodes of a seed side by side:", *made, sep="\n  ")
-
-
-def side_by_side(films: list[Path], film: Path) -> Path:
-    """Write films into one; the last picture of a shorter one stays."""
-    columns = [frames(path) for path in films]
-    rows = zip_longest(*columns)
-    shown = [column[0] for column in columns]
-    pictures = []
-    for row in rows:
-        shown = [last if new is None else new for new, last in zip(row, shown, strict=True)]
-        pictures.append(np.concatenate(shown, axis=1))
-    write_video(film, pictures, FPS)
-    return film
-
-
-def frames(film: Path) -> list[np.ndarray]:
-    with av.open(film) as container:
-        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    print("The episodes of a seed side by side:")
+    for seed, paths in films.items():
+        if paths:
+            write_video(film := folder / f"seed_{seed}.mp4", side_by_side([frames(path) for path in paths]), FPS)
+            print(f"  {film}")
 
 
 if __name__ == "__main__":

@@ -4,11 +4,10 @@ It takes the close-ups of the experts that examples/gallery.py filmed.
 """
 
 import sys
-from itertools import zip_longest
 from pathlib import Path
 
-import av
 import numpy as np
+from films import frames, side_by_side
 from PIL import Image
 
 TASKS = ("brick_to_bin_shifted", "brick_on_brick", "tile_to_grid", "tenon_to_mortise")
@@ -19,12 +18,8 @@ COLOURS = 256
 
 
 def main(films: str = "docs/films", out: str = "examples/pictures/tasks.gif") -> None:
-    rows = list(zip_longest(*(close_ups(Path(films) / f"{task}.mp4") for task in TASKS)))
-    shown = list(rows[0])
-    pictures = []
-    for row in rows:
-        shown = [new if new is not None else last for new, last in zip(row, shown, strict=True)]
-        pictures.append(Image.fromarray(np.concatenate(shown, axis=1)))
+    rows = side_by_side([close_ups(Path(films) / f"{task}.mp4") for task in TASKS])
+    pictures = [Image.fromarray(row) for row in rows]
     # One palette for all: colours that change from frame to frame flicker, and do not compress.
     palette = pictures[0].quantize(COLOURS, method=Image.Quantize.FASTOCTREE, kmeans=3)
     first, *others = (one.quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures)
@@ -33,9 +28,8 @@ def main(films: str = "docs/films", out: str = "examples/pictures/tasks.gif") ->
 
 def close_ups(film: Path) -> list[np.ndarray]:
     """The right half of every third frame, and of the last one."""
-    with av.open(film) as container:
-        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    return [frame[:, frame.shape[1] // 2 :] for frame in (*frames[::EVERY], frames[-1])]
+    seen = frames(film)
+    return [frame[:, frame.shape[1] // 2 :] for frame in (*seen[::EVERY], seen[-1])]
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.threads import one_thread
 
 
@@ -23,21 +24,37 @@ def test_the_number_of_threads_comes_back():
     assert torch.get_num_threads() == 3
 
 
-def test_the_simulator_runs_in_one_thread_and_leaves_the_rest_to_its_user(monkeypatch):
-    """Reset and step, which take whatever is simulated; another test steps a real one."""
-    seen = []
+class StandInError(Exception):
+    pass
 
-    class StandInError(Exception):
-        pass
 
-    def record(*_):
-        seen.append(torch.get_num_threads())
+class StandIn:
+    """In place of ManiSkill's environment: notes the threads and ends there. Other tests step a real one."""
+
+    def __init__(self):
+        self.seen = []
+
+    def reset(self, **_):
+        self.seen.append(torch.get_num_threads())
         raise StandInError
 
-    monkeypatch.setattr(ConstructSkillEnv, "begin", record)
-    monkeypatch.setattr(ConstructSkillEnv, "advance", record)
-    env = ConstructSkillEnv()
-    for call in (lambda: env.reset(seed=0), lambda: env.step(np.zeros(4, np.float32))):
+    step = render = privileged_state = agent_state = lambda self, *_: self.reset()
+
+
+def test_the_simulator_runs_in_one_thread_and_leaves_the_rest_to_its_user(monkeypatch):
+    stand_in = StandIn()
+    monkeypatch.setattr(ConstructSkillEnv, "make_scene", lambda self: stand_in)
+    monkeypatch.setattr(ConstructSkillEnv, "started", lambda self: stand_in)
+    env, native = ConstructSkillEnv(), NativeVectorEnv(1)
+    action = np.zeros(4, np.float32)
+    for call in (
+        lambda: env.reset(seed=0),
+        lambda: env.step(action),
+        *(env.render, env.privileged_state, env.agent_state),
+        lambda: native.reset(seed=0),
+        lambda: native.step(action[None]),
+    ):
         with pytest.raises(StandInError):
             call()
-    assert seen == [1, 1] and torch.get_num_threads() == 3
+        assert torch.get_num_threads() == 3
+    assert stand_in.seen == [1] * 7

@@ -113,12 +113,9 @@ def write_episode(
     from lerobot_constructskill.lerobot_internals import patched
 
     os.environ.setdefault("SVT_LOG", "1")
-    # There are videos and no pictures to embed, for which LeRobot would go through all rows one by one.
-    no_pictures, counted = (
-        patched("embed_images", lambda rows: rows),
-        patched("RunningQuantileStats", running_statistics()),
-    )
-    with quiet(), no_pictures, counted:
+    # The rows hold no pictures to embed, for which LeRobot would go through them one by one: there are videos.
+    as_they_are = patched("embed_images", lambda rows: rows)
+    with quiet(), as_they_are, patched("RunningQuantileStats", running_statistics()):
         dataset = LeRobotDataset.create(
             repo_id=repo_id,
             root=root,

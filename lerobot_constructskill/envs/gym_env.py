@@ -128,7 +128,6 @@ class ConstructSkillEnv(gym.Env):
 
     # Gymnasium
 
-    @one_thread()
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -144,7 +143,6 @@ class ConstructSkillEnv(gym.Env):
         self._recording = recorder(evaluation_seed=seed, backend=self.backend, **self._settings)
         return self._observation(obs), self._info(info) | {"contract": json.dumps(self.contract)}
 
-    @one_thread()
     def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Advance 1/20 s.
 
@@ -242,6 +240,7 @@ class ConstructSkillEnv(gym.Env):
             raise RuntimeError("Call reset() first: the simulator starts with the first reset.")
         return self._env
 
+    @one_thread()
     def begin(self, seed: int | list[int]) -> tuple[dict[str, Any], dict[str, Any]]:
         """Reset the ManiSkill environment; return its observation and info, of all copies."""
         # PhysX keeps contacts over a reset and the next episode would show them; a new scene takes 0.04 s in a worker.
@@ -249,6 +248,7 @@ class ConstructSkillEnv(gym.Env):
         self._steps = 0
         return result
 
+    @one_thread()
     def advance(self, action: np.ndarray) -> tuple[dict[str, Any], Any, Any, bool, dict[str, Any]]:
         """Step the ManiSkill environment by `action`, (7,) or (num_copies, 7); all copies are truncated together."""
         obs, reward, terminated, _, info = self.started().step(action)
@@ -265,6 +265,7 @@ class ConstructSkillEnv(gym.Env):
         scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = normalised(action, names)
         return scaled
 
+    @one_thread()
     def observations(self, obs: dict[str, Any]) -> dict[str, Any]:
         """The observation of every copy, arrays (num_copies, ...), without the noise of a perturbed sensor."""
         seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in self.cameras}}

@@ -68,7 +68,7 @@ class CompareConfig(Checked):
 
 
 @command(
-    "constructskill-compare 'outputs/mine/train/seed_*' results/fresh_starts:shifted/wrist_state_hidden",
+    "constructskill-compare 'outputs/mine/train/seed_*' results/precise:brick_to_bin_shifted/precise",
     first=("a", "b"),
 )
 def compare(config: CompareConfig) -> str:

@@ -72,7 +72,7 @@ def write(config: ConfigConfig) -> Path:
     held_out = f"{split.n_held_out} of them" if split.n_held_out else "too few for every eighth to be"
     text = (
         f"# {config.name} for {config.root or config.repo_id}: {plural(len(split.episodes), 'demonstration')}, "
-        f"{held_out} held out; {epochs} {'epoch' if epochs == 1 else 'epochs'}.\n"
+        f"{held_out} held out; {plural(epochs, 'epoch')}.\n"
         "# constructskill-config wrote it for this data set alone: for another set let it write another file.\n"
     )
     if file.exists() and not read_bytes(file).startswith(f"# {TRAIN}".encode()):

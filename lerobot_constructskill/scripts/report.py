@@ -12,8 +12,8 @@ class ReportConfig(Checked):
     """Write report.html, report.md and figures/ into a study's folder.
 
     The folder holds rows.parquet and study.yaml, whose settings say which tasks the rows are of, and whose section
-    `analysis` says how they are read. It may hold
-    provenance.json, one JSON object of names and values to show. A study need not be complete.
+    `analysis` says how they are read. It may hold provenance.json, one JSON object of names and values to show. A
+    study need not be complete.
     """
 
     root: Path  # the study's folder

@@ -69,7 +69,7 @@ def _introduction(config_class: type) -> str:
 def _told(config_class: type, action: argparse.Action, required: bool, presets: str | None) -> str:
     """What is said of a field: the comment beside it, or its line among `Args:`; and its default."""
     owner, _, name = action.dest.rpartition(".")
-    config = _dataclass_of(config_class, owner)
+    config = kind_of(config_class, owner) if owner else config_class
     said = ((action.help or "").strip() or _arguments(config).get(name, "")).rstrip(".")
     field = next(one for one in fields(config) if one.name == name)
     if required and _is_required(field):
@@ -77,10 +77,6 @@ def _told(config_class: type, action: argparse.Action, required: bool, presets: 
     elif "default" not in said and action.default not in (None, MISSING, argparse.SUPPRESS, "", [], (), {}):
         said += f" (default: {str(action.default).lower() if isinstance(action.default, bool) else action.default})"
     return said.strip().replace("%", "%%")
-
-
-def _dataclass_of(config_class: type, path: str) -> Any:
-    return kind_of(config_class, path) if path else config_class
 
 
 def _arguments(config_class: type) -> dict[str, str]:

@@ -75,7 +75,6 @@ def write_report(root: Path) -> Path:
     figures.write_figures(findings, root / "figures")
     context = {
         "name": name,
-        "name_of_study": name,
         "is_shipped": _is_shipped(name, rows),
         "tasks": {setting: env["task"] for setting, env in environments.items()},
         "study": read_text(root / STUDY),

@@ -1,8 +1,8 @@
 """Batches of frames without pictures, and of patch features, in a fraction of the time.
 
-LeRobot reads a batch frame by frame, and for each frame `datasets` copies the description of all columns three times:
-64 frames take 90 ms of a core, twice what training on them takes. PyTorch's loader asks a data set first for a whole
-batch (`__getitems__`); LeRobot's data set has no such method.
+LeRobot reads a batch frame by frame, and for each frame `datasets` copies the description of all columns three times,
+which takes longer than training on the batch (`benchmarks/keypoints.py`). PyTorch's loader asks a data set first for a
+whole batch, by `__getitems__`; LeRobot's data set has no such method.
 """
 
 from collections.abc import Sequence

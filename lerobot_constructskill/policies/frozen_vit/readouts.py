@@ -90,9 +90,9 @@ class SpatialSoftmax(nn.Module):
 class _Positions(torch.autograd.Function):
     """`_expected_positions` of maps that are linear in the patches, with a gradient for the patterns alone.
 
-    On a CPU its time is that of two matrix products, which take half as long in a processor's cache. So a few images'
-    patches at a time go there, and are made float32 there. Shares of a softmax so small that they change no sum are
-    set to 0: denormal numbers take ten times as long, in products above all.
+    On a CPU its time is that of two matrix products, which are faster in a processor's cache. So the patches of a few
+    images at a time go there, and are made float32 there (`benchmarks/keypoints.py`). Shares of a softmax so small
+    that they change no sum are set to 0: denormal numbers are slow, in products above all.
     """
 
     @staticmethod
