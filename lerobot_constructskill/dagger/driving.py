@@ -105,7 +105,7 @@ def drive_all(
             advice = {lane: expert.advise(PrivilegedState(**e.now.sim)) for lane, e in running.items()}
             executed = {lane: e.choose(advice[lane], proposed[lane], drive) for lane, e in running.items()}
             bar.update(len(running))
-            for lane, step in _unwrap(sims.step(executed)).items():
+            for lane, step in _unwrap(sims.step(executed).get()).items():
                 if running[lane].add(step, drive):
                     yield running.pop(lane)
 
@@ -121,7 +121,7 @@ def copies(learner: Agent, count: int) -> list[Agent]:
 def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, RunningEpisode]:
     for lane, seed in seeds.items():
         agents[lane].reset(seed)
-    steps = _unwrap(sims.reset(seeds))
+    steps = _unwrap(sims.reset(seeds).get())
     return {lane: RunningEpisode(seed, steps[lane], np.random.default_rng([seed, 1])) for lane, seed in seeds.items()}
 
 

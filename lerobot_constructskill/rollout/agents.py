@@ -16,6 +16,7 @@ from lerobot_constructskill.contract import CAMERAS
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.policy_types import read_policy
+from lerobot_constructskill.threads import one_thread
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ class PolicyAgent:
     @torch.inference_mode()
     def see(self, observation: Observation) -> dict[str, Any]:
         """Preprocess an observation to the policy's batch of one."""
-        return self.preprocessor(preprocess_observation(observation.seen) | {"task": [observation.instruction]})
+        with one_thread():
+            return self.preprocessor(preprocess_observation(observation.seen) | {"task": [observation.instruction]})
 
     @torch.inference_mode()
     def decide(self, batch: dict[str, Any]) -> np.ndarray:
@@ -140,8 +142,11 @@ class PolicyAgent:
         self._step += 1
         device = torch.device(self.policy.config.device)
         amp = torch.autocast(device.type, enabled=self.policy.config.use_amp)
-        with torch.random.fork_rng([device] if device.type == "cuda" else []), amp, observing(batch, OFFERED):
-            torch.manual_seed(int(drawn))
+        on_gpu = device.type == "cuda"
+        # Without a GPU, torch.manual_seed would note a stack trace for each kind of GPU, at every step.
+        seed_torch = torch.manual_seed if on_gpu else torch.default_generator.manual_seed
+        with torch.random.fork_rng([device] if on_gpu else []), amp, observing(batch, OFFERED):
+            seed_torch(int(drawn))
             action = self.policy.select_action(batch)
         return self.postprocessor(action).squeeze(0).cpu().numpy()
 

@@ -1,4 +1,7 @@
-"""Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder."""
+"""Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder.
+
+They step in two halves: the environments of one are at work while the agents of the other act.
+"""
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -13,7 +16,7 @@ from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
 from lerobot_constructskill.lerobot_internals import write_video
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
-from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
+from lerobot_constructskill.rollout.simulators import Answers, Simulators, Step, simulators
 
 OnStep = Callable[[int, int, np.ndarray, Step], None]
 """Called with the agent's number, the episode's, the action and what the environment returned for it."""
@@ -62,14 +65,22 @@ def roll_out(
         simulators(envs, n_workers) as sims,
         Progress(total=len(agents) * len(seeds), unit="episode", desc="rollout") as bar,
     ):
-        lanes = _Lanes(agents, env_kwargs, sims, seeds, on_step)
+        shared = Lockstep(agents)
+        groups = [
+            _Lanes(numbers, agents, shared, env_kwargs, sims, seeds, on_step)
+            for numbers in _halves(range(len(agents)))
+        ]
         bar.unpause()  # until now the simulators started
-        running = set(range(len(agents)))
-        while running:
-            bar.update(lanes.advance())
-            for i in running - lanes.current.keys():
-                running.remove(i)
-                yield i, lanes.rollouts[i]
+        while any(group.running for group in groups):
+            for group in groups:
+                bar.update(group.advance())
+                yield from group.finished()
+
+
+def _halves(numbers: range) -> list[range]:
+    """Both halves: while the environments of one are at work, the agents of the other act."""
+    middle = (len(numbers) + 1) // 2
+    return [half for half in (numbers[:middle], numbers[middle:]) if half]
 
 
 def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,54 +91,74 @@ def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class _Lanes:
-    """The agents that still run, and the last step of each one's environment."""
+    """Agents that step together, and what their environments were asked last.
+
+    Args:
+        numbers: which of `agents` they are.
+        shared: what all agents compute together.
+    """
 
     def __init__(
         self,
+        numbers: Sequence[int],
         agents: Sequence[Agent],
+        shared: Lockstep,
         env_kwargs: Mapping[str, Any],
         sims: Simulators,
         seeds: Sequence[int],
         on_step: OnStep | None,
     ):
-        self.agents, self.sims, self.seeds, self.on_step = agents, sims, seeds, on_step
+        self.agents, self.shared, self.sims, self.seeds, self.on_step = agents, shared, sims, seeds, on_step
         self.instruction = get_task(env_kwargs.get("task", "brick_to_bin")).instruction
-        self.lockstep = Lockstep(agents)
-        self.rollouts = [Rollout() for _ in agents]
-        self.current: dict[int, Step] = {}
-        self._start(range(len(agents)))
+        self.running = {i: Rollout() for i in numbers}
+        self.over: dict[int, Rollout] = {}
+        self.actions: dict[int, np.ndarray] = {}
+        self.asked = [self._start(numbers)]
 
     def advance(self) -> int:
-        """Take one step with every agent that still runs, and return how many episodes ended."""
-        seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in self.current.items()}
-        actions = self._succeeded(self.lockstep.act(seen))
-        self.current = self._succeeded(self.sims.step(actions))
-        for i, step in self.current.items():
-            episodes = self.rollouts[i].episodes
-            episodes[-1].add(actions[i], step.info)
-            episodes[-1].final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
-            if self.on_step:
-                self.on_step(i, len(episodes) - 1, actions[i], step)
-        finished = [i for i, step in self.current.items() if step.done]
-        for i in finished:
-            self.rollouts[i].backend = self.current.pop(i).backend
-        self._start([i for i in finished if len(self.rollouts[i].episodes) < len(self.seeds)])
-        return len(finished)
+        """Take what the environments answered, act, and ask them again; return how many episodes ended."""
+        current = self._succeeded({i: answer for asked in self.asked for i, answer in asked.get().items()})
+        for i in self.actions.keys() & current.keys():
+            self._keep(i, current[i])
+        ended = [i for i, step in current.items() if step.done]
+        for i in ended:
+            self.running[i].backend = current.pop(i).backend
+        again = [i for i in ended if len(self.running[i].episodes) < len(self.seeds)]
+        self.over |= {i: self.running.pop(i) for i in ended if i not in again}
+        self.asked = [self._start(again)]  # before others act, so that it goes on meanwhile
+        seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in current.items()}
+        self.actions = self._succeeded(self.shared.act(seen))
+        self.asked.append(self.sims.step(self.actions))
+        return len(ended)
 
-    def _start(self, numbers: Sequence[int]) -> None:
+    def finished(self) -> Iterator[tuple[int, Rollout]]:
+        """The agents that have finished or failed since the last time."""
+        over, self.over = self.over, {}
+        yield from over.items()
+
+    def _keep(self, i: int, step: Step) -> None:
+        """Add an agent's step to its episode."""
+        episodes, action = self.running[i].episodes, self.actions[i]
+        episodes[-1].add(action, step.info)
+        episodes[-1].final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
+        if self.on_step:
+            self.on_step(i, len(episodes) - 1, action, step)
+
+    def _start(self, numbers: Sequence[int]) -> Answers:
         """Begin the next episode of these agents."""
-        seeds = {i: self.seeds[len(self.rollouts[i].episodes)] for i in numbers}
+        seeds = {i: self.seeds[len(self.running[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
-            self.rollouts[i].episodes.append(Episode(seed))
+            self.running[i].episodes.append(Episode(seed))
         ready = self._succeeded({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})
-        self.current |= self._succeeded(self.sims.reset({i: seeds[i] for i in ready}))
+        return self.sims.reset({i: seeds[i] for i in ready})
 
     def _succeeded(self, results: dict[int, Any]) -> dict[int, Any]:
         """The results that are no exception; an agent whose result is one has failed."""
-        for i, result in results.items():
-            if isinstance(result, Exception):
-                self.rollouts[i] = Rollout(error=result)
-        return {i: result for i, result in results.items() if not isinstance(result, Exception)}
+        failed = {i: result for i, result in results.items() if isinstance(result, Exception)}
+        for i, error in failed.items():
+            del self.running[i]
+            self.over[i] = Rollout(error=error)
+        return {i: result for i, result in results.items() if i not in failed}
 
 
 class FirstEpisode:

@@ -4,7 +4,7 @@ import os
 import pickle
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -23,6 +23,8 @@ PRELOADED = [
     "lerobot_constructskill.rollout.simulators",
 ]
 """What every worker imports."""
+
+DIED = "A simulator's process died; if there was not enough memory, run fewer at once."
 
 
 @dataclass(frozen=True)
@@ -47,41 +49,57 @@ class Step:
     backend: str = ""
 
 
+class Answers:
+    """What environments return for what they were asked; they are at work until then.
+
+    Args:
+        shares: for each worker that was asked, its environments' answers by number.
+    """
+
+    def __init__(self, shares: Sequence[Future]):
+        self._shares = shares
+
+    def get(self) -> dict[int, Any]:
+        """Wait for the answers, by number; in place of one stands the exception of an environment that raised.
+
+        Raises:
+            OSError: a worker died, for instance because memory ran out.
+        """
+        answers: dict[int, Any] = {}
+        try:
+            for share in self._shares:
+                answers |= share.result()
+        except BrokenExecutor:
+            raise MachineError(DIED) from None
+        return answers
+
+
 class Simulators:
     """Environments, spread over worker processes; environment i lives in worker i % workers.
 
-    `reset` and `step` take a value for each environment by number, and return what each returned; in place of it
-    stands the exception of an environment that raised. They raise `OSError` where a worker died, for instance because
-    memory ran out.
+    `reset` and `step` take a value for each environment by number, and raise `OSError` where a worker has died.
     """
 
     def __init__(self, workers: Sequence[Executor]):
         self._workers = workers
 
-    def reset(self, seeds: Mapping[int, int]) -> dict[int, Step | Exception]:
-        """Start an episode in each named environment: number to seed."""
+    def reset(self, seeds: Mapping[int, int]) -> Answers:
+        """Have an episode start in each named environment, number to seed; the answers are of type `Step`."""
         return self._ask(_reset, seeds)
 
-    def step(self, actions: Mapping[int, np.ndarray]) -> dict[int, Step | Exception]:
-        """Advance each named environment: number to action."""
+    def step(self, actions: Mapping[int, np.ndarray]) -> Answers:
+        """Have each named environment advance, number to action; the answers are of type `Step`."""
         return self._ask(_step, actions)
 
-    def _ask(self, call: Callable[..., Any], arguments: Mapping[int, Any]) -> dict[int, Any]:
-        shares = [{} for _ in self._workers]
+    def _ask(self, call: Callable[..., Any], arguments: Mapping[int, Any]) -> Answers:
+        shares: list[dict[int, Any]] = [{} for _ in self._workers]
         for number, argument in arguments.items():
             shares[number % len(shares)][number] = argument
-        answers: dict[int, Any] = {}
         try:
-            asked = [
-                worker.submit(_answer, call, own) for worker, own in zip(self._workers, shares, strict=True) if own
-            ]
-            for future in asked:
-                answers |= future.result()
+            asked = zip(self._workers, shares, strict=True)
+            return Answers([worker.submit(_answer, call, own) for worker, own in asked if own])
         except BrokenExecutor:
-            raise MachineError(
-                "A simulator's process died; if there was not enough memory, run fewer at once."
-            ) from None
-        return answers
+            raise MachineError(DIED) from None
 
 
 @contextmanager

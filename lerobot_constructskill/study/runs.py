@@ -188,19 +188,24 @@ def _outcomes(job: Job, runs: Sequence[Run]) -> Iterator[tuple[Run, Failure | No
     """What came of each run: None where it is written, else why it is not."""
     if not runs:
         return
-    drawn = {run: run.arm.demonstrations.node for run in runs if run.arm.demonstrations}
-    failed = _lost(job, drawn)
-    with timed(job.times, runs[0].arm.id, len(runs)):
-        trained = {run: run.checkpoints for run in runs if run.checkpoints and run not in failed}
-        failed |= _lost(job, trained)
-        yield from failed.items()
-        yield from _evaluate(job, [run for run in runs if run not in failed])
+    trained = {run: run.checkpoints for run in runs if run.checkpoints and not job.store.has(run.checkpoints)}
+    failed = _lost(job, "demonstrations", {run: run.arm.demonstrations.node for run in runs if run.arm.demonstrations})
+    failed |= _lost(job, "data", {run: one.inputs["data"] for run, one in trained.items() if run not in failed})
+    failed |= _lost(job, "training", {run: one for run, one in trained.items() if run not in failed})
+    yield from failed.items()
+    if others := [run for run in runs if run not in failed]:
+        with timed(job.times, runs[0].arm.id, "evaluation", len(others)):
+            yield from _evaluate(job, others)
 
 
-def _lost(job: Job, nodes: Mapping[Run, Node]) -> dict[Run, Failure]:
-    """Make a node for each run, and return why some could not be made."""
-    failed = job.store.get_all([*nodes.values()], job.machine)
-    return {run: failed[node] for run, node in nodes.items() if node in failed}
+def _lost(job: Job, stage: str, nodes: Mapping[Run, Node]) -> dict[Run, Failure]:
+    """Make a node for each run, if it is one that is kept, and return why some could not be made."""
+    due = {run: node for run, node in nodes.items() if not (node.is_passing or job.store.has(node))}
+    if not due:
+        return {}
+    with timed(job.times, next(iter(due)).arm.id, stage, len(due)):
+        failed = job.store.get_all([*due.values()], job.machine)
+    return {run: failed[node] for run, node in due.items() if node in failed}
 
 
 def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[tuple[Run, Failure | None]]:

@@ -66,7 +66,8 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
                 progress.update()
                 progress.set_postfix_str(run.id)
         asked_for = {run.id for run in chosen}
-        validate(chosen, [run for run in runs if run.id not in asked_for], store, Machine(options.workers))
+        others = [run for run in runs if run.id not in asked_for]
+        validate(chosen, others, store, Machine(options.workers), root)
         table.read_again()
         table.write()
         return table

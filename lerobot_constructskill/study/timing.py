@@ -1,9 +1,11 @@
-"""How long runs took, for estimates: each piece of work adds a line to a file. No torch, no simulator."""
+"""How long the stages of a study took, for plans and reports: each adds a line to a file. No torch, no simulator."""
 
 import json
 import time
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TypedDict
 
@@ -14,35 +16,76 @@ from lerobot_constructskill.files import Json, read_bytes
 TIMINGS = "timings.jsonl"
 """File in a study's folder."""
 
+STAGES = ("demonstrations", "data", "training", "evaluation", "validation")
+"""In the order of a study: demonstrations; what policies learn from, made of them (features, the rounds of DAgger);
+checkpoints; episodes; held-out errors."""
+
+OF_A_RUN = STAGES[1:4]
+"""Stages that a study's plan counts for each run. Demonstrations it names apart."""
+
 
 class _Entry(TypedDict):
     arm: str
+    stage: str
+    runs: Annotated[int, Ge(1)]
     seconds: Annotated[float, Ge(0), Lt(1e9)]
 
 
-ENTRY = Json("the time of a run", _Entry)
+ENTRY = Json("the time of a stage", _Entry)
+
+
+@dataclass(frozen=True)
+class Took:
+    """How long a stage took, over all of a study.
+
+    Args:
+        stage: one of `STAGES`.
+        runs: runs that it was made for.
+        seconds: on the wall.
+    """
+
+    stage: str
+    runs: int
+    seconds: float
 
 
 @contextmanager
-def timed(root: Path, arm: str, runs: int) -> Iterator[None]:
+def timed(root: Path, arm: str, stage: str, runs: int) -> Iterator[None]:
     """Note how long the block takes; work of a killed process is not counted.
 
     Args:
-        arm: setting/variant of the runs that are made.
+        arm: setting/variant of the runs that it is for.
+        stage: one of `STAGES`.
         runs: how many.
     """
     start = time.monotonic()
     yield
-    entry = {"arm": arm, "seconds": round((time.monotonic() - start) / runs, 1)}
+    entry = {"arm": arm, "stage": stage, "runs": runs, "seconds": round(time.monotonic() - start, 1)}
     with (root / TIMINGS).open("a", encoding="utf-8") as file:  # a short write, which others do not tear
         file.write(json.dumps(entry) + "\n")
 
 
 def seconds_per_run(root: Path) -> dict[str, float]:
     """What a run of each arm took, trained and evaluated, the last time that some were made."""
-    file, took = root / TIMINGS, {}
+    last: dict[str, dict[str, float]] = defaultdict(dict)
+    for entry in _entries(root):
+        if entry["stage"] in OF_A_RUN:
+            last[entry["arm"]][entry["stage"]] = entry["seconds"] / entry["runs"]
+    return {arm: sum(took.values()) for arm, took in last.items() if "evaluation" in took}
+
+
+def time_by_stage(root: Path) -> list[Took]:
+    """What each stage of a study took in all, in the order of `STAGES`."""
+    runs: dict[str, int] = defaultdict(int)
+    seconds: dict[str, float] = defaultdict(float)
+    for entry in _entries(root):
+        runs[entry["stage"]] += entry["runs"]
+        seconds[entry["stage"]] += entry["seconds"]
+    return [Took(stage, runs[stage], seconds[stage]) for stage in STAGES if stage in runs]
+
+
+def _entries(root: Path) -> Iterator[_Entry]:
+    file = root / TIMINGS
     for line in read_bytes(file).splitlines() if file.exists() else []:
         with suppress(ValueError):  # a line that a full disk or a power cut tore, or of another version
-            entry = ENTRY.parse(line.decode(), f"A line of '{file}'")
-            took[entry["arm"]] = entry["seconds"]
-    return took
+            yield ENTRY.parse(line.decode(), f"A line of '{file}'")

@@ -2,26 +2,33 @@
 
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 
 from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.study.runs import Arm, NamedSet, Run
+from lerobot_constructskill.study.timing import timed
 from lerobot_constructskill.training.heldout import HeldOutError
 
 logger = logging.getLogger(__name__)
 
 
-def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: Machine) -> None:
+def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: Machine, times: Path) -> None:
     """Measure the held-out errors that are not known yet; those that cannot be measured are logged and stay unknown.
 
     Args:
         runs: those whose policies are validated.
         others: the other runs of their study, which are not asked for.
+        times: folder of the file that says what took how long.
     """
     pairs = list_pairs(runs, others)
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
-        failed = store.get_all(nodes, machine)
+        due = [node for node in nodes if not store.has(node)]
+        if not due:
+            continue
+        with timed(times, arm.id, "validation", len(due)):
+            failed = store.get_all(due, machine)
         for said in dict.fromkeys(failure.said for failure in failed.values()):
             logger.warning("%s is not validated on %s: %s", arm.id, data.name, said)
         for node, failure in failed.items():

@@ -8,6 +8,7 @@ import pytest
 from synthetic_study import HOSTILE, STUDY, failed_row, missing_row, study_rows, write_study
 
 from lerobot_constructskill.analysis.report.page import write_report
+from lerobot_constructskill.study.timing import TIMINGS
 
 
 @pytest.fixture(scope="session")
@@ -23,6 +24,8 @@ def study(tmp_path_factory) -> Path:
         (root / video).write_bytes(b"film" if index == 0 else bytes(3 * 1024**2))
         rows[index] = dataclasses.replace(rows[index], video=video)
     (root / "provenance.json").write_text(json.dumps({"wall_time": "3 h", "cpu": HOSTILE}))
+    took = {"arm": "fixed/clip", "stage": "training", "runs": 10, "seconds": 630}
+    (root / TIMINGS).write_text(json.dumps(took) + "\n")
     write_study(root, rows=rows)
     write_report(root)
     return root

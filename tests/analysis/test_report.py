@@ -75,6 +75,10 @@ def test_page_holds_the_papers_tables_and_every_figure(study):
 
 
 @pytest.mark.slow
+def test_the_time_of_each_stage_is_in_minutes_and_for_a_run(study):
+    assert "| training | 10 | 10 | 63 |" in (study / "report.md").read_text()
+
+
 def test_each_table_has_the_command_that_makes_its_lines_again(study):
     """A study that is not one of ours is made from its file."""
     text = " ".join(" ".join(Reader((study / "report.html").read_text()).text).split())

@@ -27,6 +27,13 @@ ENV = {"task": "brick_to_bin", "obs_type": "pixels", "episode_length": 150}
 SEEDS = [2_000_000, 2_000_001, 2_000_002]
 
 
+class Answered(dict):
+    """`Answers` that are there."""
+
+    def get(self):
+        return self
+
+
 class InThisProcess:
     """`Simulators` of toys."""
 
@@ -34,7 +41,7 @@ class InThisProcess:
         self.envs = [ToyEnv(**kwargs) for kwargs in env_kwargs]
 
     def reset(self, seeds):
-        return {number: simulators._reset(self.envs[number], seed) for number, seed in seeds.items()}
+        return Answered({number: simulators._reset(self.envs[number], seed) for number, seed in seeds.items()})
 
     def step(self, actions):
         answers = {}
@@ -42,7 +49,7 @@ class InThisProcess:
             step = simulators._step(self.envs[number], action)
             placed = step.done and self.envs[number].steps < ENV["episode_length"]
             answers[number] = replace(step, info={"is_success": placed})
-        return answers
+        return Answered(answers)
 
 
 @pytest.fixture(autouse=True)

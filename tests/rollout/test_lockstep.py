@@ -1,5 +1,6 @@
 """Rollouts in lockstep are `lerobot-eval`'s, step for step, and a policy that fails takes none down with it."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +14,17 @@ from lerobot_constructskill.contract import GRIPPER_CLOSED
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import native_precision
+from lerobot_constructskill.rollout import lockstep
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import roll_out
+from lerobot_constructskill.rollout.simulators import Step
 
 pytestmark = [pytest.mark.sim]
 
 IMAGE = PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
 STEPS, SEEDS = 7, [1000, 1001]
 ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial state depends on the seed
+NOTHING_YET = {"clipped_steps": 0, "is_lifted": False, "is_in_bin": False, "is_success": False}
 
 
 def random_agent(config, seed, **fields):
@@ -122,6 +126,58 @@ def test_an_encoder_that_fails_takes_those_with_it_that_share_it_and_no_other(co
     *failed, other, still = (run for _, run in sorted(roll_out([*agents, *others], ENV, SEEDS, n_workers=2)))
     assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2
     assert other.error is None and still.error is None
+
+
+class Noting:
+    """Environments of one step that note when they are asked, and when their answers are waited for."""
+
+    def __init__(self, events):
+        self.events = events
+
+    def reset(self, seeds):
+        return self._answers("reset", seeds, done=False)
+
+    def step(self, actions):
+        return self._answers("step", actions, done=True)
+
+    def _answers(self, what, asked, done):
+        for number in asked:
+            self.events.append((what, number))
+        sim = {"object_pose": np.zeros(7), "bin_position": np.zeros(3)}
+        told = {number: Step({}, sim, done, NOTHING_YET) for number in asked}
+
+        def get():
+            for number in asked:
+                self.events.append(("answered", number))
+            return told
+
+        return SimpleNamespace(get=get)
+
+
+def test_agents_of_one_half_act_while_the_environments_of_the_other_are_at_work(monkeypatch):
+    events = []
+
+    class Acting(Broken):
+        def __init__(self, number):
+            super().__init__(np.zeros(4, dtype=np.float32))
+            self.number = number
+
+        def act(self, observation):
+            events.append(("act", self.number))
+            return super().act(observation)
+
+    monkeypatch.setattr(lockstep, "simulators", lambda *_: nullcontext(Noting(events)))
+    outcomes = dict(roll_out([Acting(number) for number in range(4)], ENV, SEEDS))
+    assert all(outcome.error is None and len(outcome.episodes) == len(SEEDS) for outcome in outcomes.values())
+    at_work, meanwhile = set(), set()
+    for what, number in events:
+        if what in ("reset", "step"):
+            at_work.add(number)
+        elif what == "answered":
+            at_work.discard(number)
+        elif what == "act":
+            meanwhile |= {(number, other) for other in at_work}
+    assert meanwhile == {(mine, other) for mine in (0, 1) for other in (2, 3)} | {(2, 0), (2, 1), (3, 0), (3, 1)}
 
 
 class Looking(Broken):

@@ -24,7 +24,7 @@ def test_a_worker_that_died_is_one_sentence(submits):
             return future
 
     with pytest.raises(MachineError, match="A simulator's process died"):
-        Simulators([Dying()]).step({0: None})
+        Simulators([Dying()]).step({0: None}).get()
 
 
 def test_a_worker_is_deaf_to_ctrl_c_and_its_death_is_noticed():
@@ -35,4 +35,4 @@ def test_a_worker_is_deaf_to_ctrl_c_and_its_death_is_noticed():
         assert worker.submit(os.getpid).result() == process
         os.kill(process, signal.SIGKILL)
         with pytest.raises(MachineError, match="A simulator's process died"):
-            sims.reset({0: 1})
+            sims.reset({0: 1}).get()

@@ -42,7 +42,7 @@ from lerobot_constructskill.study.session import choose, run_study
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.status import status
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import TIMINGS, seconds_per_run, timed
+from lerobot_constructskill.study.timing import TIMINGS, seconds_per_run, time_by_stage, timed
 from lerobot_constructskill.study.validate import heldout, list_pairs
 from lerobot_constructskill.training.heldout import FILE
 from lerobot_constructskill.training.recipe import Training
@@ -370,13 +370,26 @@ def test_a_failed_run_stays_a_row_until_it_is_made_again(tmp_path):
 
 
 def test_a_torn_line_of_times_is_left_out(tmp_path):
-    with timed(tmp_path, "fixed/a", 1):
+    with timed(tmp_path, "fixed/a", "evaluation", 1):
         pass
     with (tmp_path / TIMINGS).open("a") as file:
-        file.write('{"arm": "fix{"arm": "fixed/b", "seconds": 0.0}\n')
-    with timed(tmp_path, "fixed/c", 1):
+        file.write('{"arm": "fix{"arm": "fixed/b", "stage": "evaluation", "runs": 1, "seconds": 0.0}\n')
+    with timed(tmp_path, "fixed/c", "evaluation", 1):
         pass
     assert seconds_per_run(tmp_path) == {"fixed/a": 0.0, "fixed/c": 0.0}
+    assert [(one.stage, one.runs) for one in time_by_stage(tmp_path)] == [("evaluation", 2)]
+
+
+def test_the_time_of_a_stage_is_a_sum_and_that_of_a_run_is_the_last_one(tmp_path):
+    lines = [("training", 10, 100), ("evaluation", 10, 50), ("training", 2, 30), ("demonstrations", 10, 1000)]
+    told = ({"arm": "fixed/a", "stage": stage, "runs": runs, "seconds": took} for stage, runs, took in lines)
+    (tmp_path / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in told))
+    assert seconds_per_run(tmp_path) == {"fixed/a": 20.0}, "15 s to train and 5 to evaluate"
+    assert [(one.stage, one.runs, one.seconds) for one in time_by_stage(tmp_path)] == [
+        ("demonstrations", 10, 1000),
+        ("training", 12, 130),
+        ("evaluation", 10, 50),
+    ]
 
 
 def test_a_study_goes_on_where_the_backbone_computes_in_another_precision(tmp_path, monkeypatch):
@@ -537,10 +550,10 @@ def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, 
 def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
     runs = list_runs(study())
     table = Table(tmp_path, runs, Store(tmp_path / "store"))
-    with timed(tmp_path, "fixed/a", 2):
+    with timed(tmp_path, "fixed/a", "evaluation", 2):
         pass  # what took long ago is not what it takes
     with (tmp_path / TIMINGS).open("a") as file:
-        file.write(json.dumps({"arm": "fixed/a", "seconds": 200}) + "\n")
+        file.write(json.dumps({"arm": "fixed/a", "stage": "evaluation", "runs": 2, "seconds": 400}) + "\n")
     lines = status(table, runs).splitlines()
     told = dict(zip(lines, lines[1:], strict=False))
     assert told["fixed/a: 0 finished, 0 failed, 3 missing"] == "    to make: seeds 0, 1, 2, about 10 min"

@@ -32,6 +32,7 @@ from lerobot_constructskill.study.rows import (
     read_environments,
     read_rows,
 )
+from lerobot_constructskill.study.timing import time_by_stage
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -81,6 +82,7 @@ def write_report(root: Path) -> Path:
         "findings": findings,
         "films": partial(films, root, rows),
         "facts": provenance(root, rows),
+        "stages": time_by_stage(root),
         "version": metadata.version("lerobot_env_constructskill"),
     }
     for form, finalize in {"md": _escape_markdown, "html": None}.items():

@@ -9,6 +9,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from lerobot_constructskill.files import Json
+from lerobot_constructskill.threads import one_thread
 
 from . import openvino
 from .backbones import IMAGE_SIZE, Backbone
@@ -101,10 +102,12 @@ class FrozenEncoder(nn.Module):
         return pooled.expand(len(images), -1), patches.expand(len(images), -1, -1)
 
     def _encode(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        with computing_in("float32", self.device):  # OpenVINO cannot convert the casts of autocast
+        if self.runtime == "openvino":
+            # OpenVINO cannot convert the casts of autocast. Torch's other threads would keep cores from it.
+            with computing_in("float32", self.device), one_thread():
+                return self._compile()(self.preprocess(images))
+        with computing_in("float32", self.device):
             pixels = self.preprocess(images)
-            if self.runtime == "openvino":
-                return self._compile()(pixels)
         with computing_in(self.precision, self.device):
             pooled, patches = self.spec.encode(self.model, pixels)
         return pooled.float(), patches.float()

@@ -4,6 +4,7 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from lerobot_constructskill.errors import InputError, MissingError, first_line
 from lerobot_constructskill.files import Json
+from lerobot_constructskill.threads import one_thread
 
 from .backbones import get_backbone
 from .batches import read_whole_batches
@@ -305,7 +307,9 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         return pooled, batch[OBS_STATE]
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        return self.heads(*self.head_inputs(batch))[0]
+        inputs = self.head_inputs(batch)
+        with one_thread() if self.backbone.device.type == "cpu" else nullcontext():
+            return self.heads(*inputs)[0]
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
         if POOLED in batch:

@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lerobot_constructskill.threads import threads
+
 from .weights import Encode
 
 HINTS = {"float32": "f32", "bfloat16": "bf16"}
@@ -50,7 +52,7 @@ class OpenVINOEncoder:
         graph.reshape(list(example.shape))
         settings = {
             "INFERENCE_PRECISION_HINT": HINTS[precision],
-            "INFERENCE_NUM_THREADS": torch.get_num_threads(),
+            "INFERENCE_NUM_THREADS": threads(),
             "PERFORMANCE_HINT": "THROUGHPUT",
         }
         self._requests = openvino.AsyncInferQueue(openvino.Core().compile_model(graph, "CPU", settings))

@@ -8,6 +8,8 @@ import torch
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor
 
+from lerobot_constructskill.threads import one_thread
+
 from .feature_sets import describe
 
 POOLED = "observation.pooled"
@@ -86,7 +88,8 @@ class FrameCache:
             return torch.cat(pooled).split(1)[: len(images)]
         if self.policy.backbone.runtime == "torch":
             return [self.policy.pool(image) for image in images]  # batches are no faster here, and round differently
-        return self.policy.pool(torch.cat(images)).split(1)
+        with one_thread():
+            return self.policy.pool(torch.cat(images)).split(1)
 
 
 def _identity(policy: PreTrainedPolicy) -> Hashable:
