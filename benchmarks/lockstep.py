@@ -12,7 +12,7 @@ def main(folder: Path, steps: int) -> None:
     paths = sorted(folder.iterdir())
     agents = [PolicyAgent.from_pretrained(path, "cpu") for path in paths]
     total = 0
-    for i, outcome in roll_out(agents, {"episode_length": steps}, seeds=[1000]):
+    for i, outcome in roll_out(agents, {"episode_length": steps}, seeds=[[1000]] * len(agents)):
         print(paths[i].name, *outcome.episodes, outcome.error or "")
         total += sum(episode.steps for episode in outcome.episodes)
     print("steps:", total)

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 
 import draccus
@@ -126,6 +126,22 @@ def test_the_dose_response_is_six_doses_of_one_set():
     fixed = sets["fixed"]
     for millimetres, name in doses.items():
         assert sets[name] == replace(fixed, noise=replace(fixed.noise, sigma=millimetres / 1000))
+
+
+def seeds_of(runs):
+    """Seeds of initial states that runs use: of attempted demonstrations and of evaluation episodes."""
+    sets = {run.arm.demonstrations.node for run in runs if run.arm.demonstrations}
+    lists = [run.arm.starts for run in runs] + [node.starts for node in sets]
+    return set(chain(*lists, *(run.plan.config.starts for run in runs if run.plan)))
+
+
+def test_nothing_was_chosen_on_draws_starts_or_seeds_that_are_reported():
+    runs = {path.stem: list_runs(parse(StudyConfig, [], path).study) for path in STUDIES}
+    reported = seeds_of(runs.pop("draws"))
+    for name, others in runs.items():
+        assert not reported & seeds_of(others), name
+    chosen_with = {run.seed for run in runs["draws_choice"]}
+    assert min(chosen_with) >= 200, "training seeds from 0 on are reported"
 
 
 def test_the_papers_study_holds_its_52_runs():

@@ -45,7 +45,7 @@ def evaluate(
                 check_inputs(agent.policy.config, facts["obs_type"])
             except InputError as error:
                 raise InputError(f"'{checkpoint}': {error}") from None
-        rollouts = dict(roll_out(agents, env, starts))
+        rollouts = dict(roll_out(agents, env, [starts] * len(agents)))
         for number, checkpoint in enumerate(group):
             if (error := rollouts[number].error) is not None:
                 said = " ".join(f"{type(error).__name__}: {error}".split())

@@ -48,6 +48,7 @@ class MatchedSides:
         a, b: the sides.
         conditions: conditions that both were evaluated in.
         starts: starts that both have, in order.
+        episodes: how many of them each training seed was evaluated from: all, unless draws have starts of their own.
         n_starts: number of different starts that the sides have together.
         rates_a, rates_b: share of the episodes from `starts` that placed, of each training seed; 0 for a failed one.
         judgement: the statistics.
@@ -57,6 +58,7 @@ class MatchedSides:
     b: Side
     conditions: dict[str, Any]
     starts: list[int]
+    episodes: int
     n_starts: int
     rates_a: list[float]
     rates_b: list[float]
@@ -73,17 +75,44 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
     _check_sources(a, b, asked)
     sides = {one: read(one) for one in (a, b) if one.kind != CHECKPOINT}
     env = _common_env(sides.values(), asked)
-    starts = _common_starts(sides.values(), asked)
-    for one in (a, b):
-        if one.kind == CHECKPOINT:
-            sides[one] = evaluate(one, env, starts)
+    if apart := _starts_apart(list(sides.values())):
+        starts, episodes, either = sorted(set.union(*apart)), len(apart[0]), set.union(*apart)
+    else:
+        starts = _common_starts(sides.values(), asked)
+        for one in (a, b):
+            if one.kind == CHECKPOINT:
+                sides[one] = evaluate(one, env, starts)
+        episodes, either = len(starts), set.union(*(side.starts or set() for side in sides.values()))
     rates_a, rates_b = (
-        [np.mean([placed[start] for start in starts]) if placed else 0.0 for placed in sides[one].seeds]
-        for one in (a, b)
+        [_rate([placed[start] for start in starts if start in placed]) if placed else 0.0 for placed in side.seeds]
+        for side in (sides[a], sides[b])
     )
-    either = set.union(*(side.starts or set() for side in sides.values()))
     judgement = judge(np.array(rates_a), np.array(rates_b), alpha)
-    return MatchedSides(sides[a], sides[b], conditions(env), starts, len(either), rates_a, rates_b, judgement)
+    return MatchedSides(
+        sides[a], sides[b], conditions(env), starts, episodes, len(either), rates_a, rates_b, judgement
+    )
+
+
+def _rate(placed: Sequence[bool]) -> float:
+    return float(np.mean(placed))
+
+
+def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:
+    """Starts of each training seed, where both sides are known and their draws have the same starts of their own.
+
+    Raises:
+        InputError: of one side seeds have starts of their own, and the other side has not the same.
+    """
+    each = [side.starts_apart for side in known]
+    if not any(each):
+        return None
+    if len(known) == 2 and each[0] == each[1]:
+        return each[0]
+    own = next(side for side, starts in zip(known, each, strict=True) if starts)
+    raise InputError(
+        f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose training "
+        "seeds have the same ones."
+    )
 
 
 def _check_sources(a: Source, b: Source, asked: Asked) -> None:

@@ -15,7 +15,15 @@ from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode,
 from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, check_folder, read_environments, read_rows
+from lerobot_constructskill.study.rows import (
+    NOT_RUN,
+    ROWS,
+    STUDY,
+    check_folder,
+    read_draws,
+    read_environments,
+    read_rows,
+)
 
 Placements = Mapping[int, bool]
 """Start (seed of an evaluation episode) to whether the episode placed the object."""
@@ -42,6 +50,7 @@ class Side:
         env: keyword arguments of the `ConstructSkillEnv` that it was evaluated in.
         seeds: placements of each training seed; None for a seed whose training or evaluation failed.
         versions: packages, processor and simulator that its episodes were made with.
+        covered: what an interval over its seeds covers, as `study.rows.Draws.covered`; None if that is not known.
     """
 
     name: str
@@ -49,6 +58,15 @@ class Side:
     env: Mapping[str, Any]
     seeds: list[Placements | None]
     versions: dict[str, str]
+    covered: str | None = None
+
+    @property
+    def starts_apart(self) -> list[set[int]] | None:
+        """Starts of each seed, where no two draws share any; None where seeds have starts in common, or one failed."""
+        each = [set(placed) for placed in self.seeds if placed]
+        different = {frozenset(starts) for starts in each}
+        apart = len(different) > 1 and sum(map(len, different)) == len(set.union(*each))
+        return each if apart and len(each) == len(self.seeds) else None
 
     @property
     def starts(self) -> set[int] | None:
@@ -184,6 +202,7 @@ def read_study(root: Path, arm: str) -> Side:
         env=envs[setting],
         seeds=[_placements_of_rows(own) for _, own in rows.groupby("training_seed", sort=True)],
         versions=merge_versions(_versions(text, backend) for text, backend in made_with),
+        covered=read_draws(root).covered,
     )
 
 

@@ -22,8 +22,14 @@ CONCLUSIONS = {
 def tell(matched: MatchedSides, alpha: float) -> str:
     """The whole output, one paragraph for each question of a reader."""
     judgement = matched.judgement
-    paragraphs = (_sides(matched), _conclusion(judgement, alpha), _power(judgement, alpha), _versions(matched))
-    return "\n\n".join(paragraphs)
+    paragraphs = (
+        _sides(matched),
+        _conclusion(judgement, alpha),
+        _power(judgement, alpha),
+        _covered(matched),
+        _versions(matched),
+    )
+    return "\n\n".join(filter(None, paragraphs))
 
 
 def as_json(matched: MatchedSides) -> str:
@@ -36,7 +42,9 @@ def as_json(matched: MatchedSides) -> str:
 
 def _sides(matched: MatchedSides) -> str:
     judgement, starts, where = matched.judgement, matched.starts, matched.conditions
-    n = f"{len(starts)}" + f" of {matched.n_starts} that A or B has" * (matched.n_starts > len(starts))
+    n = f"{len(starts)}"
+    n += f", {matched.episodes} a draw" * (matched.episodes < len(starts))
+    n += f" of {matched.n_starts} that A or B has" * (matched.n_starts > len(starts))
     steps = plural(where["episode_length"], "step")
     lines = [
         f"A  {matched.a.name}: {matched.a.kind}",
@@ -48,9 +56,12 @@ def _sides(matched: MatchedSides) -> str:
         "A": (matched.a, judgement.counts_a, judgement.mean_a, matched.rates_a),
         "B": (matched.b, judgement.counts_b, judgement.mean_b, matched.rates_b),
     }
-    lines += ["", f"   {'seeds that placed':<19}{'episodes placed, mean of seeds':<32}each seed, of {len(starts)}"]
+    lines += [
+        "",
+        f"   {'seeds that placed':<19}{'episodes placed, mean of seeds':<32}each seed, of {matched.episodes}",
+    ]
     for letter, (side, counts, mean, rates) in sides.items():
-        each = [f"{rate * len(starts):.0f}" for rate in rates]
+        each = [f"{rate * matched.episodes:.0f}" for rate in rates]
         each = ["failed" if seed is None else number for number, seed in zip(each, side.seeds, strict=True)]
         share = f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})"
         lines.append(f"{letter}  {f'{counts.met} of {counts.seeds}':<19}{share:<32}{' '.join(each)}")
@@ -91,6 +102,16 @@ def _power(judgement: Judgement, alpha: float) -> str:
         number = f"more than {MOST}" if needed == inf else f"about {needed}"
         told += f" To find the difference that was seen, {number} seeds a side would be needed."
     return told
+
+
+def _covered(matched: MatchedSides) -> str:
+    """What the intervals are over, and that the sides differ in it."""
+    a, b = matched.a.covered, matched.b.covered
+    if a == b:
+        return f"The intervals cover {a}." if a else ""
+    told = {letter: f"{letter}'s interval covers {one}." for letter, one in (("A", a), ("B", b)) if one}
+    missing = [f"What {letter}'s covers, its files do not say." for letter in "AB" if letter not in told]
+    return " ".join([*told.values(), *missing, "Demonstrations can make the difference as well as policies."])
 
 
 def _versions(matched: MatchedSides) -> str:

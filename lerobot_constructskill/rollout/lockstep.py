@@ -40,17 +40,18 @@ class Rollout:
 def roll_out(
     agents: Sequence[Agent],
     env_kwargs: Mapping[str, Any],
-    seeds: Sequence[int],
+    seeds: Sequence[Sequence[int]],
     n_workers: int | None = None,
     on_step: OnStep | None = None,
     filmed: Collection[int] = (),
 ) -> Iterator[tuple[int, Rollout]]:
-    """Run every agent through one episode per seed, in `ConstructSkillEnv(**env_kwargs)`.
+    """Run every agent through its episodes in `ConstructSkillEnv(**env_kwargs)`.
 
     An agent's episodes are those of `lerobot-eval` with the same seeds and one environment, step for step, but for a
     policy that samples. An agent that raises has failed; the others go on.
 
     Args:
+        seeds: for each agent those of its episodes' initial states.
         n_workers: simulator processes; one per core by default.
         filmed: agents of whom `on_step` is shown every camera; of others, those that the agent looks at.
 
@@ -63,7 +64,7 @@ def roll_out(
     envs = [env_kwargs if i in filmed else _rendered(agent, env_kwargs) | env_kwargs for i, agent in enumerate(agents)]
     with (
         simulators(envs, n_workers) as sims,
-        Progress(total=len(agents) * len(seeds), unit="episode", desc="rollout") as bar,
+        Progress(total=sum(map(len, seeds)), unit="episode", desc="rollout") as bar,
     ):
         shared = Lockstep(agents)
         groups = [
@@ -105,7 +106,7 @@ class _Lanes:
         shared: Lockstep,
         env_kwargs: Mapping[str, Any],
         sims: Simulators,
-        seeds: Sequence[int],
+        seeds: Sequence[Sequence[int]],
         on_step: OnStep | None,
     ):
         self.agents, self.shared, self.sims, self.seeds, self.on_step = agents, shared, sims, seeds, on_step
@@ -123,7 +124,7 @@ class _Lanes:
         ended = [i for i, step in current.items() if step.done]
         for i in ended:
             self.running[i].backend = current.pop(i).backend
-        again = [i for i in ended if len(self.running[i].episodes) < len(self.seeds)]
+        again = [i for i in ended if len(self.running[i].episodes) < len(self.seeds[i])]
         self.over |= {i: self.running.pop(i) for i in ended if i not in again}
         self.asked = [self._start(again)]  # before others act, so that it goes on meanwhile
         seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in current.items()}
@@ -146,7 +147,7 @@ class _Lanes:
 
     def _start(self, numbers: Sequence[int]) -> Answers:
         """Begin the next episode of these agents."""
-        seeds = {i: self.seeds[len(self.running[i].episodes)] for i in numbers}
+        seeds = {i: self.seeds[i][len(self.running[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
             self.running[i].episodes.append(Episode(seed))
         ready = self._succeeded({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from typing import Any
 
 from lerobot.envs import EnvConfig
@@ -17,9 +18,9 @@ from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
-from lerobot_constructskill.study.rows import REFERENCE, SIGHTLESS, VARIANT
+from lerobot_constructskill.study.rows import OWN, REFERENCE, SHARED, SIGHTLESS, VARIANT
 from lerobot_constructskill.study.runs import Arm, NamedSet, Run
-from lerobot_constructskill.study.spec import SHARED, Study, Variant
+from lerobot_constructskill.study.spec import Study, Variant
 from lerobot_constructskill.training.checkpoints import check_inputs
 from lerobot_constructskill.training.recipe import Training
 from lerobot_constructskill.training.trainers import Learner
@@ -28,7 +29,7 @@ OURS = "constructskill"
 """The one environment that a study evaluates in."""
 
 SEEDS_APART = 2_000
-"""From the first attempt's seed of a training seed's own demonstrations to that of the next one's."""
+"""From the first attempt's seed of a draw of demonstrations to that of the next one's."""
 
 
 def list_runs(study: Study) -> list[Run]:
@@ -42,47 +43,70 @@ def list_runs(study: Study) -> list[Run]:
         with _inside(f"settings.{name}.env"):
             env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
-        evaluation = {"seed": study.eval_seed, "episodes": study.episodes}
-        starts = range(study.eval_seed, study.eval_seed + study.episodes)
-        for data in sets.values():
-            check_apart({f"demonstrations '{data.name}'": data.node.starts, "evaluation": starts})
-        common = {"setting": name, "env": env, "evaluation": evaluation, "validated_on": tuple(sets.values())}
+        common = {"setting": name, "env": env, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
-            for seeds, drawn in _draws(study, range(count), sets):
-                arm = _reference_arm(study, reference, drawn, common)
-                runs += [Run(arm, seed) for seed in seeds]
+            for draw in _draws(study, range(count), sets):
+                arm = _reference_arm(study, reference, draw.sets, common | {"evaluation": draw.evaluation})
+                runs += [Run(arm, seed) for seed in draw.seeds]
         for variant_name, variant in study.variants_in(name).items():
-            for seeds, drawn in _draws(study, variant.training_seeds, sets):
-                arm = _variant_arm(study, variant_name, variant, drawn[study.data_for(name, variant)], common)
-                runs += [Run(arm, seed) for seed in seeds]
+            for draw in _draws(study, variant.training_seeds, sets):
+                data = draw.sets[study.data_for(name, variant)]
+                arm = _variant_arm(study, variant_name, variant, data, common | {"evaluation": draw.evaluation})
+                runs += [Run(arm, seed) for seed in draw.seeds]
     return runs
 
 
-def _draws(
-    study: Study, seeds: range, sets: dict[str, NamedSet]
-) -> Iterator[tuple[Sequence[int], dict[str, NamedSet]]]:
-    """Training seeds, and the demonstrations of a setting that they all learn from."""
-    if study.demonstrations == SHARED:
-        yield seeds, sets
-        return
-    for seed in seeds:
-        yield [seed], {name: _drawn_for(seed, one) for name, one in sets.items()}
+@dataclass(frozen=True)
+class _Draw:
+    """Training seeds that have in common what they learn from and where they are evaluated.
+
+    Args:
+        seeds: the training seeds.
+        sets: the demonstrations of a setting, by name.
+        starts: seeds of the evaluation episodes.
+    """
+
+    seeds: Sequence[int]
+    sets: dict[str, NamedSet]
+    starts: range
+
+    @property
+    def evaluation(self) -> dict[str, int]:
+        return {"seed": self.starts.start, "episodes": len(self.starts)}
 
 
-def _drawn_for(seed: int, data: NamedSet) -> NamedSet:
-    """A training seed's own draw of some demonstrations; seed 0 has those that all seeds would share.
+def _draws(study: Study, seeds: range, sets: dict[str, NamedSet]) -> Iterator[_Draw]:
+    """The draws of some training seeds of a setting with these demonstrations.
 
     Raises:
-        InputError: two draws could have attempts in common.
+        InputError: demonstrations could begin as an evaluation episode of any draw does, or as those of another draw.
     """
+    first, last = (study.starts_of(study.draws.of(seed)) for seed in (seeds[0], seeds[-1]))
+    for number, own in groupby(seeds, key=study.draws.of):
+        drawn = {name: _drawn(number, one) for name, one in sets.items()} if number else sets
+        if study.demonstrations == OWN:
+            for one in sets.values():
+                _check_room(one)
+        for one in drawn.values():
+            evaluated = range(first.start, last.stop)
+            check_apart({f"demonstrations '{one.name}'": one.node.starts, "evaluation": evaluated})
+        yield _Draw([*own], drawn, study.starts_of(number))
+
+
+def _check_room(data: NamedSet) -> None:
+    """Refuse demonstrations of which two draws could have attempts in common."""
     config = data.node.config
     attempts = config.episodes * (1 + config.max_failures)
     if attempts > SEEDS_APART:
         raise InputError(
-            f"{data.name} may take {attempts:,.0f} attempts; of demonstrations that each training seed has of its "
-            f"own, none may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
+            f"{data.name} may take {attempts:,.0f} attempts; of demonstrations that each draw has of its own, none "
+            f"may take more than {SEEDS_APART:,} (episodes, and max_failures times as many)."
         )
-    moved = seed * SEEDS_APART
+
+
+def _drawn(draw: int, data: NamedSet) -> NamedSet:
+    """A draw of some demonstrations; draw 0 has those that all seeds would share."""
+    config, moved = data.node.config, draw * SEEDS_APART
     return NamedSet(data.name, Demonstrations(replace(config, seed_start=config.seed_start + moved)), moved)
 
 
@@ -90,8 +114,8 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
         check_inputs(learner.config, common["env"]["obs_type"])
-    first, starts = study.eval_seed, {"demonstrations": data.node.starts}
-    starts["evaluation"] = range(first, first + study.episodes)
+    first, episodes = common["evaluation"]["seed"], common["evaluation"]["episodes"]
+    starts = {"demonstrations": data.node.starts, "evaluation": range(first, first + episodes)}
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
     with _inside(f"variants.{name}"):

@@ -7,7 +7,7 @@ has one row for every run that failed or has not been made.
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 import pandas as pd
 import pyarrow as pa
@@ -53,8 +53,43 @@ class _Environment(TypedDict):
     env: _Env
 
 
+SHARED, OWN = "shared", "own"
+"""Whether all training seeds learn from the same demonstrations, or each draw has its own; of starts likewise."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Which training seeds of a study share demonstrations, and starts.
+
+    Args:
+        demonstrations: `SHARED` by all training seeds, or each draw's `OWN`.
+        starts: the same of the starts.
+        seeds_a_draw: training seeds that share a draw.
+    """
+
+    demonstrations: str = SHARED
+    starts: str = SHARED
+    seeds_a_draw: int = 1
+
+    def of(self, seed: int) -> int:
+        """The draw that a training seed learns from; 0 where all share one."""
+        return seed // self.seeds_a_draw if self.demonstrations == OWN else 0
+
+    @property
+    def covered(self) -> str:
+        """What intervals over the study's runs cover."""
+        if self.demonstrations == SHARED:
+            return "training seeds alone: all share one draw of demonstrations and one list of starts"
+        if self.starts == SHARED:
+            return "draws of demonstrations and training seeds: all share one list of starts"
+        return "draws of demonstrations, lists of starts and training seeds"
+
+
 class _Settings(TypedDict):
     settings: dict[str, _Environment]
+    demonstrations: NotRequired[Literal["shared", "own"]]
+    starts: NotRequired[Literal["shared", "own"]]
+    seeds_a_draw: NotRequired[Annotated[int, Ge(1)]]
 
 
 SETTINGS = Yaml("a study's file", _Settings)
@@ -67,6 +102,16 @@ def read_environments(root: Path) -> dict[str, dict[str, Any]]:
         InputError: its file is not a study's.
     """
     return {name: of["env"] for name, of in SETTINGS.read(root / STUDY)["settings"].items()}
+
+
+def read_draws(root: Path) -> Draws:
+    """Read which training seeds of a study's folder share demonstrations and starts.
+
+    Raises:
+        InputError: its file is not a study's.
+    """
+    study = SETTINGS.read(root / STUDY)
+    return Draws(study.get("demonstrations", SHARED), study.get("starts", SHARED), study.get("seeds_a_draw", 1))
 
 
 def check_folder(root: Path) -> None:

@@ -58,7 +58,7 @@ class NamedSet:
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A variant or a reference in one setting: its runs differ in their seed alone.
+    """A variant or a reference in one setting, on one draw: its runs differ in their seed alone.
 
     Args:
         setting, name, role: as in `rows.Row`.
@@ -85,6 +85,11 @@ class Arm:
     @property
     def id(self) -> str:
         return f"{self.setting}/{self.name}"
+
+    @property
+    def starts(self) -> range:
+        """Seeds of the evaluation episodes."""
+        return range(self.evaluation["seed"], self.evaluation["seed"] + self.evaluation["episodes"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +220,11 @@ def _evaluate(job: Job, runs: Sequence[Run]) -> Iterator[tuple[Run, Failure | No
     if not agents:
         return
     runs = [*agents]
-    arm = runs[0].arm  # in the environment and in how it is evaluated, one is like the other
-    first, count = arm.evaluation["seed"], arm.evaluation["episodes"]
+    env = runs[0].arm.env  # in the environment one is like the other
     filmed = [number for number, run in enumerate(runs) if run.seed == FILMED_SEED]
     film = FirstEpisode(next(iter(filmed), None))
     how = {"on_step": film.add, "filmed": filmed, "n_workers": job.machine.simulators}
-    for number, rollout in roll_out([*agents.values()], arm.env, range(first, first + count), **how):
+    for number, rollout in roll_out([*agents.values()], env, [run.arm.starts for run in runs], **how):
         if rollout.error is None:
             _write_finished(job, runs[number], rollout, partial(film.write, number))
         yield runs[number], rollout.error and Failure.of(rollout.error)

@@ -20,14 +20,11 @@ from lerobot_constructskill.bounds import (
     check_fields,
 )
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study.rows import OWN, SHARED, Draws
 from lerobot_constructskill.training.recipe import Training
 
 NAME = r"[a-z0-9][a-z0-9_-]*"
 """What studies, settings and variants are called: they name folders and videos, and stand in every row."""
-
-SHARED, OWN = "shared", "own"
-"""Whether all training seeds learn from the same demonstrations, or each from its own."""
-
 
 Seeds = Annotated[int, Range(1, 1000)]
 
@@ -91,8 +88,11 @@ class Study:
         demonstrations: `shared`: the training seeds of a variant learn from the same data set, and differ in the
             initial weights and the order of the frames. `own`: each learns from a draw of its own, so that they differ
             in their demonstrations (and in the starts of DAgger's rounds) as well.
+        starts: `shared`: all runs are evaluated from the same starts. `own`: each draw has starts of its own.
+        seeds_a_draw: training seeds that share a draw of `own`: 3 means that seeds 0 to 2 have the first one.
         episodes: evaluation episodes of a run.
-        eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`.
+        eval_seed: seed of the first evaluation episode; episode i has seed `eval_seed + i`, and of `own` starts draw d
+            begins at `eval_seed + d * episodes`.
 
     Raises:
         ValueError: a name or a number that cannot be used.
@@ -104,6 +104,8 @@ class Study:
     references: dict[str, int] = field(default_factory=dict)
     training: Training = field(default_factory=Training)
     demonstrations: Annotated[str, Among((SHARED, OWN))] = SHARED
+    starts: Annotated[str, Among((SHARED, OWN))] = SHARED
+    seeds_a_draw: Seeds = 1
     episodes: Count = 10
     eval_seed: Seed = 1000
 
@@ -141,6 +143,8 @@ class Study:
                 raise InputError(
                     f"Variant '{name}': all variants of a setting hold out the same; give it to the setting."
                 )
+        if self.demonstrations == SHARED and (self.starts, self.seeds_a_draw) != (SHARED, 1):
+            raise InputError("starts and seeds_a_draw are of draws: they need `demonstrations: own`.")
         if bare := [name for name in self.settings if not self.variants_in(name)]:
             raise InputError(f"No variant runs in the setting '{bare[0]}', so there would be nothing to report.")
 
@@ -154,6 +158,15 @@ class Study:
     def variants_in(self, setting: str) -> dict[str, Variant]:
         """The variants that run in a setting, by name."""
         return {name: v for name, v in self.variants.items() if setting in (v.settings or self.settings)}
+
+    @property
+    def draws(self) -> Draws:
+        return Draws(self.demonstrations, self.starts, self.seeds_a_draw)
+
+    def starts_of(self, draw: int) -> range:
+        """The evaluation episodes' seeds of a draw's runs."""
+        first = self.eval_seed + (draw * self.episodes if self.starts == OWN else 0)
+        return range(first, first + self.episodes)
 
     def data_for(self, setting: str, variant: Variant) -> str:
         """The demonstrations that a variant is trained on in a setting; for DAgger they are labelled as its rounds."""

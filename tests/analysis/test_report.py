@@ -228,6 +228,27 @@ def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_f
     assert "<td>better</td>" in "".join(first) and "<td>better</td>" not in "".join(strict)
 
 
+def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures):
+    drawn = SMALL | {"variants": {"one": {"seeds": 6}}, "episodes": 10}
+    placed = [9, 8, 2, 3, 6, 7]
+    rows = [
+        row
+        for seed, count in enumerate(placed)
+        for row in episode_rows(drawn, ("fixed", "one", seed), lifted=10, placed=count)
+    ]
+    said = {}
+    for shared in (True, False):
+        root = tmp_path / str(shared)
+        of = drawn if shared else drawn | {"demonstrations": "own", "seeds_a_draw": 2}
+        write_study(root, of, rows)
+        said[shared] = report(ReportConfig(root)) and (root / "report.md").read_text()
+    assert "They cover training seeds alone" in said[True] and "is made of" not in said[True]
+    assert "They cover draws of demonstrations and training seeds" in said[False]
+    assert "What the spread between runs is made of" in said[False] and "one_draws" not in said[False]
+    mean = {shared: re.search(r"5\.8 \(([\d.]+)–([\d.]+)\)", text).groups() for shared, text in said.items()}
+    assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])
+
+
 def test_declared_comparisons_are_the_family(tmp_path):
     findings = findings_of(STUDY, study_rows(), tmp_path, comparisons=[["clip", "dinov2"], ["augreg", "dinov2"]])
     fixed, moved = findings.settings

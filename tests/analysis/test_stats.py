@@ -18,6 +18,7 @@ from lerobot_constructskill.analysis.stats.comparisons import (
     probability_better,
     spread_p_value,
 )
+from lerobot_constructskill.analysis.stats.components import split
 from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
 from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, mean_rate, newcombe
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
@@ -290,6 +291,48 @@ def test_kendall_needs_errors_and_outcomes_that_differ(rng):
     assert kendall(error, -error, one, np.random.default_rng(0)) == kendall(
         error[:9], -error[:9], one[:9], np.random.default_rng(0)
     )
+
+
+def drawn_episodes(rng, draws, seeds, starts, deviations):
+    """Draws, seeds on each and starts of each that move the chance of an episode by so much (standard deviations)."""
+    rows = []
+    for draw in range(draws):
+        of_draw, of_starts = rng.normal(0, deviations[0]), rng.normal(0, deviations[2], starts)
+        for seed in range(seeds):
+            chances = np.clip(0.5 + of_draw + rng.normal(0, deviations[1]) + of_starts, 0, 1)
+            met = rng.random(starts) < chances
+            rows += [(draw, draw * seeds + seed, draw * starts + start, bool(met[start])) for start in range(starts)]
+    return pd.DataFrame(rows, columns=["draw", "training_seed", "evaluation_seed", "met"])
+
+
+@pytest.mark.parametrize("deviations", [(0.15, 0.03, 0.1), (0.03, 0.15, 0.1), (0.1, 0.1, 0.0)])
+def test_the_spread_is_split_as_an_analysis_of_variance_splits_it(deviations, rng):
+    """Its mean squares give the same where every draw has as many seeds and starts (Searle et al. 1992)."""
+    draws, seeds, starts = shape = 30, 4, 40
+    episodes = drawn_episodes(rng, *shape, deviations)
+    met = episodes["met"].to_numpy(float).reshape(shape)
+    of_draws, of_seeds, of_starts = met.mean((1, 2)), met.mean(2), met.mean(1)
+    rest = met - of_seeds[:, :, None] - of_starts[:, None, :] + of_draws[:, None, None]
+    squares = {
+        "draws": seeds * starts * of_draws.var(ddof=1),
+        "seeds": starts * np.square(of_seeds - of_draws[:, None]).sum() / (draws * (seeds - 1)),
+        "starts": seeds * np.square(of_starts - of_draws[:, None]).sum() / (draws * (starts - 1)),
+        "rest": np.square(rest).sum() / (draws * (seeds - 1) * (starts - 1)),
+    }
+    variances = (
+        (squares["draws"] - squares["seeds"] - squares["starts"] + squares["rest"]) / (seeds * starts),
+        (squares["seeds"] - squares["rest"]) / starts,
+        (squares["starts"] - squares["rest"]) / seeds / starts,
+    )
+    for estimate, variance in zip(split(episodes), variances, strict=True):
+        assert estimate.value == pytest.approx(np.sqrt(max(variance, 0)), abs=0.004)
+        assert estimate.low <= estimate.value <= estimate.high
+
+
+def test_what_cannot_be_told_apart_is_not(rng):
+    assert split(drawn_episodes(rng, 1, 4, 20, (0.1, 0.1, 0.1))) is None, "one draw"
+    assert split(drawn_episodes(rng, 4, 1, 20, (0.1, 0.1, 0.1))) is None, "a seed a draw"
+    assert split(drawn_episodes(rng, 4, 2, 20, (0.1, 0.1, 0.1)).assign(met=True)) is None, "all alike"
 
 
 def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_run_is_not():

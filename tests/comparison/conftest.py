@@ -21,9 +21,17 @@ def study(tmp_path):
     """Write a study's folder; return what names its variant.
 
     Each training seed placed from so many starts, the first ones; it failed where that is None, was not run where -1.
+    `draws` are fields of the study's file.
     """
 
-    def write(placed: Sequence[int | None], name: str = "study", env: dict = ENV, starts: Sequence = STARTS) -> str:
+    def write(
+        placed: Sequence[int | None],
+        name="study",
+        env: dict = ENV,
+        starts: Sequence = STARTS,
+        draws: dict | None = None,
+    ) -> str:
+        draws = draws or {}
         common = {"run": None, "setting": "block", "variant": "ours", "role": VARIANT, "episodes": len(starts)}
         common["versions"] = json.dumps({"lerobot": "0.6.1", "torch": name, "processor": "a CPU"})
         rows = []
@@ -32,12 +40,15 @@ def study(tmp_path):
                 fault = {"error_kind": "fault" if count is None else NOT_RUN, "error": "it fell"}
                 rows.append(Row(training_seed=seed, evaluation_seed=starts[0], episode=0, **fault, **common))
                 continue
+            moved = seed * len(starts) if draws.get("starts") == "own" else 0
             for i, start in enumerate(starts):
-                rows.append(Row(training_seed=seed, evaluation_seed=start, episode=i, placed=i < count, **common))
+                rows.append(
+                    Row(training_seed=seed, evaluation_seed=moved + start, episode=i, placed=i < count, **common)
+                )
         folder = tmp_path / name
         folder.mkdir()
         write_rows(rows, folder / "rows.parquet")
-        (folder / "study.yaml").write_text(yaml.safe_dump({"settings": {"block": {"env": env}}}))
+        (folder / "study.yaml").write_text(yaml.safe_dump({"settings": {"block": {"env": env}}} | draws))
         return f"{folder}:block/ours"
 
     return write

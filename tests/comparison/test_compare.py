@@ -8,6 +8,7 @@ import pytest
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.comparison.match import Asked, MatchedSides, match
 from lerobot_constructskill.comparison.sides import Side, conditions, find, read_study
+from lerobot_constructskill.comparison.tell import tell
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.recording import Episode
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
@@ -88,6 +89,26 @@ def test_starts_are_those_in_common(study):
     with pytest.raises(InputError, match="no start in common: .* has 1000 to 1009 and .* has 2000 to 2004"):
         compared(whole, study(GOOD, "elsewhere", starts=range(2000, 2005)))
     assert compared(whole, study(BAD, "bad"), episodes=3).starts == [1000, 1001, 1002]
+
+
+def test_rows_over_draws_are_not_compared_with_rows_of_one_draw_in_silence(study, recorded):
+    own = {"demonstrations": "own"}
+    one, drawn, theirs = study(GOOD), study(BAD, "drawn", draws=own), study(BAD, "theirs", draws=own)
+    assert "The intervals cover draws of demonstrations and training seeds" in tell(compared(drawn, theirs), 0.05)
+    told = tell(compared(one, drawn), 0.05)
+    assert "A's interval covers training seeds alone" in told and "B's interval covers draws" in told
+    assert "Demonstrations can make the difference" in told
+    assert "What A's covers, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
+
+
+def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, checkpoints):
+    own = {"demonstrations": "own", "starts": "own"}
+    comparison = compared(study(GOOD, draws=own), study(BAD, "other", draws=own))
+    assert comparison.rates_a == [count / 10 for count in GOOD] and comparison.rates_b == [count / 10 for count in BAD]
+    assert "starts 1000 to 1049 (50, 10 a draw)" in tell(comparison, 0.05)
+    for other in (study(GOOD, "shared"), checkpoints(2)):
+        with pytest.raises(InputError, match="Each draw of '.*' has starts of its own"):
+            compared(study(GOOD, f"own {len(other)}", draws=own), other)
 
 
 def test_checkpoints_are_evaluated_where_the_other_side_was(study, checkpoints):

@@ -68,7 +68,7 @@ def test_lockstep_equals_lerobot_eval_step_for_step(fields, config, vector):
     agents = [random_agent(config, seed, **fields) for seed in range(2)]
     seen = {}
     keep = lambda i, episode, action, _: seen.setdefault((i, episode), []).append(action)  # noqa: E731
-    outcomes = dict(roll_out(agents, ENV, SEEDS, on_step=keep))
+    outcomes = dict(roll_out(agents, ENV, [SEEDS] * len(agents), on_step=keep))
     assert all(len(outcome.episodes) == 2 and outcome.error is None for outcome in outcomes.values())
     assert len({id(agent.policy.backbone) for agent in agents}) == 1
     for (i, episode), actions in seen.items():
@@ -105,7 +105,8 @@ def test_an_agent_that_cannot_see_or_begin_is_recorded_and_the_others_go_on(conf
     monkeypatch.setattr(unready, "reset", no_beginning)
     monkeypatch.setattr(sightless, "preprocessor", no_image)
     hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
-    found = (rollout for _, rollout in sorted(roll_out([unready, hover, sightless, sharing], ENV, SEEDS, n_workers=2)))
+    lanes = [unready, hover, sightless, sharing]
+    found = (rollout for _, rollout in sorted(roll_out(lanes, ENV, [SEEDS] * 4, n_workers=2)))
     not_begun, fine, unseen, seen = found
     assert "no beginning" in str(not_begun.error) and isinstance(unseen.error, KeyError)
     assert all(rollout.error is None and len(rollout.episodes) == len(SEEDS) for rollout in (fine, seen))
@@ -123,7 +124,7 @@ def test_an_encoder_that_fails_takes_those_with_it_that_share_it_and_no_other(co
     monkeypatch.setattr(FrozenViTChunkPolicy, "pool", out_of_memory)
     hover = Broken(np.array([0, 0, 0, GRIPPER_CLOSED], dtype=np.float32))
     others = [random_agent(config, 2, crop=[0.25, 0.25, 0.75, 0.75]), hover]
-    *failed, other, still = (run for _, run in sorted(roll_out([*agents, *others], ENV, SEEDS, n_workers=2)))
+    *failed, other, still = (run for _, run in sorted(roll_out([*agents, *others], ENV, [SEEDS] * 4, n_workers=2)))
     assert [str(rollout.error) for rollout in failed] == ["no room for the batch"] * 2
     assert other.error is None and still.error is None
 
@@ -167,7 +168,7 @@ def test_agents_of_one_half_act_while_the_environments_of_the_other_are_at_work(
             return super().act(observation)
 
     monkeypatch.setattr(lockstep, "simulators", lambda *_: nullcontext(Noting(events)))
-    outcomes = dict(roll_out([Acting(number) for number in range(4)], ENV, SEEDS))
+    outcomes = dict(roll_out([Acting(number) for number in range(4)], ENV, [SEEDS] * 4))
     assert all(outcome.error is None and len(outcome.episodes) == len(SEEDS) for outcome in outcomes.values())
     at_work, meanwhile = set(), set()
     for what, number in events:
@@ -197,7 +198,8 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
     unsaid = Looking(None)
     del unsaid.cameras
     agents = [Looking(("wrist",)), Looking(("wrist",)), Looking(()), Looking(policy.cameras), unsaid]
-    outcomes = dict(roll_out(agents, ENV | {"obs_type": "pixels_agent_pos"}, SEEDS[:1], n_workers=2, filmed=[1]))
+    env = ENV | {"obs_type": "pixels_agent_pos"}
+    outcomes = dict(roll_out(agents, env, [SEEDS[:1]] * 5, n_workers=2, filmed=[1]))
     assert all(outcome.error is None for outcome in outcomes.values())
     both = ("base", "wrist")
     assert [agent.seen for agent in agents] == [("wrist",), both, ("base",), ("wrist",), both]
@@ -211,7 +213,9 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
 def test_a_failing_agent_is_recorded_and_the_others_go_on():
     hover = Broken(np.array([0, 0, 0.5, GRIPPER_CLOSED], dtype=np.float32))
     agents = [Broken(None), hover, Broken(np.full(4, np.nan, dtype=np.float32))]
-    failed, fine, refused = (outcome for _, outcome in sorted(roll_out(agents, ENV, SEEDS, n_workers=2)))
+    failed, fine, refused = (
+        outcome for _, outcome in sorted(roll_out(agents, ENV, [SEEDS] * len(agents), n_workers=2))
+    )
     assert "lost the plot" in str(failed.error) and failed.episodes == []
     assert "finite" in str(refused.error) and refused.episodes == []
     assert fine.error is None

@@ -150,6 +150,44 @@ def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
         list_runs(study(variants=often, demonstrations="own"))
 
 
+def test_seeds_of_a_draw_share_its_demonstrations_and_starts_and_no_other_draw_has_any_of_them():
+    drawn = study(
+        variants={"a": Variant(ACT, seeds=6)},
+        references={"no_op": 2},
+        demonstrations="own",
+        starts="own",
+        seeds_a_draw=2,
+        eval_seed=300,
+        episodes=5,
+    )
+    runs = [run for run in list_runs(drawn) if run.arm.name == "a"]
+    assert [list(run.arm.starts) for run in runs] == [
+        list(range(300 + 5 * (n // 2), 305 + 5 * (n // 2))) for n in range(6)
+    ]
+    assert [run.arm.demonstrations.moved for run in runs] == [SEEDS_APART * (n // 2) for n in range(6)]
+    assert len({run.digest for run in runs}) == 6
+    near = replace(drawn, settings={"fixed": Setting("smoke --seed_start=309", ENV)})
+    with pytest.raises(InputError, match="evaluation 300 to 314"):
+        list_runs(near)
+    for fields in ({"starts": "own"}, {"seeds_a_draw": 2}):
+        with pytest.raises(InputError, match="they need `demonstrations: own`"):
+            study(**fields)
+
+
+def test_each_run_is_evaluated_from_its_own_draws_starts(tmp_path, monkeypatch):
+    asked = []
+
+    def rolled(agents, env, seeds, **how):
+        asked.extend(list(one) for one in seeds)
+        return iter(())
+
+    monkeypatch.setattr(runs_module, "roll_out", rolled)
+    drawn = study(references={"no_op": 3}, demonstrations="own", starts="own", eval_seed=300)
+    runs = [run for run in list_runs(drawn) if run.arm.name == "no_op"]
+    assert [*make_runs(Job(tuple(runs), Store(tmp_path), tmp_path))] == []
+    assert asked == [[300, 301], [302, 303], [304, 305]]
+
+
 @pytest.mark.parametrize(("demonstrations", "computations"), [("shared", 1), ("own", 3)])
 def test_a_variants_seeds_are_evaluated_in_one_pass_and_trained_in_one_if_their_data_are_the_same(
     demonstrations, computations, tmp_path, monkeypatch

@@ -37,7 +37,10 @@ SHADES = 64
 
 
 def write_figures(findings: Findings, folder: Path) -> None:
-    """Write the figures as PNG: `seeds`, `<setting>_error` of each setting with held-out errors, and `sweeps`."""
+    """Write the figures as PNG.
+
+    They are `seeds`, `sweeps`, and `<setting>_error` and `<setting>_draws` of settings with held-out errors or draws.
+    """
     folder.mkdir(exist_ok=True)
     with matplotlib.rc_context(fname=STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # a label may be in any script
@@ -45,6 +48,8 @@ def write_figures(findings: Findings, folder: Path) -> None:
         for setting in findings.sections:
             if setting.validated:
                 save(error_figure(setting, findings.episodes), folder / f"{setting.name}_error.png")
+            if setting.drawn:
+                save(draws_figure(setting, findings.episodes), folder / f"{setting.name}_draws.png")
         if findings.sweeps:
             save(sweeps_figure(findings), folder / "sweeps.png")
 
@@ -90,6 +95,21 @@ def error_figure(setting: SettingFindings, episodes: int) -> Figure:
         axes[0].xaxis.set_major_formatter("{x:g}")
     axes[0].set(ylabel=f"episodes of {episodes}", ylim=(-0.08 * episodes, 1.08 * episodes))
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure
+
+
+def draws_figure(setting: SettingFindings, episodes: int) -> Figure:
+    """Episodes of each run that placed, by draw of demonstrations: a mark a training seed, a bar their mean."""
+    figure, axes = _panels(2.6, 1, len(setting.drawn), sharey=True)
+    for axis, one in zip(axes, setting.drawn, strict=True):
+        by_draw = [runs["placed"] for _, runs in one.runs.groupby("draw", sort=False)]
+        for number, placed in enumerate(by_draw):
+            axis.hlines(placed.mean(), number - 0.3, number + 0.3, color=MUTED)
+            beside = number + np.linspace(-0.15, 0.15, len(placed)) * (len(placed) > 1)
+            axis.plot(beside, placed, "o", color="#1d5b94", markeredgecolor="white")
+        axis.set_xticks(range(len(by_draw)))
+        axis.set(title=fill(one.label, 40), xlabel="draw of demonstrations")
+    axes[0].set(ylabel=f"placed of {episodes}", ylim=(-0.06 * episodes, 1.06 * episodes))
     return figure
 
 

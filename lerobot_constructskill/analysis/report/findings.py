@@ -6,6 +6,7 @@ from typing import NamedTuple
 import pandas as pd
 
 from lerobot_constructskill.analysis.stats.comparisons import Comparison
+from lerobot_constructskill.analysis.stats.components import Components
 from lerobot_constructskill.analysis.stats.correlation import Correlation
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.outcomes import Counts
@@ -17,7 +18,7 @@ class Success(NamedTuple):
     Args:
         counts: seeds that met it in at least one episode.
         exact: share of those seeds with Clopper-Pearson's interval.
-        mean: share of episodes, averaged over seeds, with Gaffke's interval.
+        mean: share of episodes, averaged over seeds, with Gaffke's interval over draws, or over seeds of one draw.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
     """
 
@@ -36,10 +37,11 @@ class VariantFindings:
         label: name in tables.
         demonstrations: name of the data set that it was trained on; None without one.
         training_seeds: planned seeds, in order.
-        runs: runs that were made, as rows of `runs_of`.
+        runs: runs that were made, as rows of `runs_of`, with their `draw`.
         success: criterion to success; empty if no run finished, so that missing runs never look like zeros.
         error: held-out error in m2, mean and range over seeds; None if it is unknown.
         errors_by_data: the same on each data set of the setting.
+        components: what the spread of the share of placed episodes is made of, where that can be told.
     """
 
     name: str
@@ -50,6 +52,7 @@ class VariantFindings:
     success: dict[str, Success]
     error: Estimate | None
     errors_by_data: dict[str, Estimate | None]
+    components: Components | None
 
     @property
     def seeds(self) -> int:
@@ -117,6 +120,11 @@ class SettingFindings:
         return [one for one in self.variants if one.error is not None]
 
     @property
+    def drawn(self) -> list[VariantFindings]:
+        """Variants whose draws, seeds and starts can be told apart."""
+        return [one for one in self.variants if one.components]
+
+    @property
     def labels(self) -> dict[str, str]:
         """Variant to label."""
         return {variant.name: variant.label for variant in self.variants}
@@ -148,7 +156,7 @@ class Findings:
         sweeps: settings that differ in one thing.
         alpha: level of the tests.
         episodes: evaluation episodes of a run.
-        first_seed: seed of the first evaluation episode.
+        first_seed, last_seed: smallest and largest seed of an evaluation episode.
         planned: number of planned runs of variants.
         planned_references: number of planned runs of references.
         missing: planned runs of variants and references that were not made.
@@ -159,6 +167,7 @@ class Findings:
     alpha: float
     episodes: int
     first_seed: int
+    last_seed: int
     planned: int
     planned_references: int
     missing: int

@@ -34,6 +34,12 @@ def points_range(estimate: Estimate) -> str:
     return f"{points(estimate.low)} to {points(estimate.high)}"
 
 
+def deviation(estimate: Estimate) -> str:
+    """A standard deviation of shares in points: "6.1 (3.2–11.4)"; of one that is 0, "0"."""
+    value, low, high = (f"{100 * share:.1f}" for share in estimate)
+    return f"{value} ({low}–{high})" if estimate.high < float("inf") else "0"
+
+
 def p_value(p: float) -> str:
     """A p-value as journals print it: "0.0031", "0.042", "0.65", "< 0.0001"."""
     if p < 1e-4:

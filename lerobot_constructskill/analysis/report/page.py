@@ -29,6 +29,7 @@ from lerobot_constructskill.study.rows import (
     ROWS,
     STUDY,
     check_folder,
+    read_draws,
     read_environments,
     read_rows,
 )
@@ -69,7 +70,8 @@ def write_report(root: Path) -> Path:
         InputError: one of them cannot be read, or they do not belong together.
     """
     name, analysis, rows = read_study(root)
-    findings = summarize(analysis, rows)
+    draws = read_draws(root)
+    findings = summarize(analysis, rows, draws)
     environments = read_environments(root)
     if unknown := set(rows["setting"]) - set(environments):
         raise InputError(f"'{root / STUDY}' has no setting '{min(unknown)}', which rows in {ROWS} are of.")
@@ -80,6 +82,7 @@ def write_report(root: Path) -> Path:
         "tasks": {setting: env["task"] for setting, env in environments.items()},
         "study": read_text(root / STUDY),
         "findings": findings,
+        "covered": draws.covered,
         "films": partial(films, root, rows),
         "facts": provenance(root, rows),
         "stages": time_by_stage(root),

@@ -16,30 +16,34 @@ from lerobot_constructskill.analysis.report.findings import (
 )
 from lerobot_constructskill.analysis.section import Analysis
 from lerobot_constructskill.analysis.stats.comparisons import compare
+from lerobot_constructskill.analysis.stats.components import Components, split
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, count, runs_of
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.rows import NOT_RUN, VARIANT
+from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Draws
 
 
-def summarize(analysis: Analysis, rows: pd.DataFrame) -> Findings:
+def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws = Draws()) -> Findings:  # noqa: B008  immutable
     """Compute what a report says. The same rows give the same numbers, including resampled intervals.
 
     Args:
         analysis: how to read the rows.
         rows: one row per episode, from `study.rows.read_rows`.
+        draws: which training seeds share demonstrations.
 
     Raises:
         InputError: there are no rows, they contradict each other, or `analysis` names something unknown.
     """
     check_rows(rows)
+    rows = rows.assign(draw=rows["training_seed"].map(draws.of))
     planned, runs = rows.drop_duplicates(RUN), runs_of(rows)
+    runs = runs.assign(draw=runs["training_seed"].map(draws.of))
     of_variants = planned["role"] == VARIANT
     variants, references = (planned.loc[chosen, "variant"].unique() for chosen in (of_variants, ~of_variants))
     analysis.check(variants, planned["setting"].unique(), references)
     settings = {
-        name: _setting(analysis, name, own, runs[runs["setting"] == name])
+        name: _setting(analysis, name, own, runs[runs["setting"] == name], rows[rows["setting"] == name])
         for name, own in planned.groupby("setting", sort=False)
     }
     return Findings(
@@ -50,6 +54,7 @@ def summarize(analysis: Analysis, rows: pd.DataFrame) -> Findings:
         alpha=analysis.alpha,
         episodes=int(rows["episodes"].iloc[0]),
         first_seed=int(rows["evaluation_seed"].min()),
+        last_seed=int(rows["evaluation_seed"].max()),
         planned=int(of_variants.sum()),
         planned_references=int((~of_variants).sum()),
         missing=int((planned["error_kind"] == NOT_RUN).sum()),
@@ -80,10 +85,14 @@ def check_rows(rows: pd.DataFrame) -> None:
         )
 
 
-def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame) -> SettingFindings:
+def _setting(
+    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+) -> SettingFindings:
     """One setting. Only the tables follow `analysis.order`, so that another order shows the same numbers."""
     of_variants = planned["role"] == VARIANT
-    variants, references = (_variants(analysis, planned[chosen], runs) for chosen in (of_variants, ~of_variants))
+    variants, references = (
+        _variants(analysis, planned[chosen], runs, episodes) for chosen in (of_variants, ~of_variants)
+    )
     ordered = sorted(variants, key=lambda one: analysis.rank(one.name))
     pairs = analysis.comparisons
     if pairs is None:
@@ -107,14 +116,18 @@ def _setting(analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.Data
     )
 
 
-def _variants(analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame) -> list[VariantFindings]:
+def _variants(
+    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+) -> list[VariantFindings]:
     return [
-        _variant(analysis.label(name), own, runs[runs["variant"] == name])
+        _variant(analysis.label(name), own, runs[runs["variant"] == name], episodes[episodes["variant"] == name])
         for name, own in planned.groupby("variant", sort=False)
     ]
 
 
-def _variant(label: str, planned: pd.DataFrame, runs: pd.DataFrame) -> VariantFindings:
+def _variant(
+    label: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None = None
+) -> VariantFindings:
     finished = runs["error_kind"].isna().any()
     by_data = pd.DataFrame([json.loads(errors) for errors in runs["heldout_mse_m2_by_data"].dropna()])
     return VariantFindings(
@@ -126,7 +139,12 @@ def _variant(label: str, planned: pd.DataFrame, runs: pd.DataFrame) -> VariantFi
         success={criterion: _success(runs, criterion) for criterion in CRITERIA} if finished else {},
         error=_mean_and_range(runs["heldout_mse_m2"]),
         errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
+        components=None if episodes is None else _components(episodes),
     )
+
+
+def _components(episodes: pd.DataFrame) -> Components | None:
+    return split(episodes[episodes["error_kind"].isna()].rename(columns={"placed": "met"}))
 
 
 def _mean_and_range(errors: pd.Series) -> Estimate | None:
@@ -137,7 +155,10 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
 def _success(runs: pd.DataFrame, criterion: str) -> Success:
     rates = _rates(runs, criterion)
     counts = count(rates)
-    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
+    several = 1 < runs["draw"].nunique() < len(runs)  # draws with several seeds, which are alike
+    units = runs.groupby("draw")[f"{criterion}_rate"].mean().to_numpy() if several else rates
+    mean = mean_rate(units)._replace(value=float(rates.mean()))
+    return Success(counts, clopper_pearson(counts), mean, float(rates.std()))
 
 
 def _rates(runs: pd.DataFrame, criterion: str) -> np.ndarray:

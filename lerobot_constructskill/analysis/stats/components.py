@@ -1,0 +1,72 @@
+"""What the spread between runs is made of: draws of demonstrations, training seeds on one draw, and starts."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from statsmodels.regression.mixed_linear_model import MixedLM, MixedLMResults
+from statsmodels.tools.sm_exceptions import ConvergenceWarning
+
+from lerobot_constructskill.analysis.stats.intervals import Estimate
+
+NORMAL = 1.96
+"""Quantile of the standard normal distribution for an interval of 95 %."""
+
+
+class Components(NamedTuple):
+    """Standard deviations of a run's share of successful episodes, in [0, 1], each with its 95 % interval.
+
+    Args:
+        draws: between draws of demonstrations.
+        seeds: between training seeds on one draw.
+        starts: between lists of as many starts as a run has.
+    """
+
+    draws: Estimate
+    seeds: Estimate
+    starts: Estimate
+
+
+def split(episodes: pd.DataFrame) -> Components | None:
+    """Split the spread by a linear mixed model of the episodes, fitted by restricted maximum likelihood.
+
+    A linear model of outcomes that are 0 or 1 gives components in points, which add up; those of a logistic one have
+    no such meaning. The intervals are Wald's of the logarithm: 0 to infinity where a component is estimated as 0.
+
+    Args:
+        episodes: a row an episode: `draw`, `training_seed`, `evaluation_seed` and whether it succeeded, `met`.
+
+    Returns:
+        None where they cannot be told apart: fewer than two draws, no draw with two seeds, or all ended alike.
+    """
+    seeds = episodes.groupby("draw")["training_seed"].nunique()
+    if len(seeds) < 2 or seeds.max() < 2 or episodes["met"].nunique() < 2:
+        return None
+    told = episodes.astype({"draw": int, "training_seed": int, "evaluation_seed": int, "met": float})
+    parts = {"seeds": "0 + C(training_seed)", "starts": "0 + C(evaluation_seed)"}
+    model = MixedLM.from_formula("met ~ 1", told, re_formula="1", vc_formula=parts, groups="draw")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # of a component at 0, which its interval says
+        warnings.simplefilter("ignore", RuntimeWarning)
+        fit = model.fit(reml=True, method="powell")  # others stop short where a component is 0
+        found = _deviations(fit, model.exog_vc.names)
+    a_run = np.sqrt(episodes.groupby(["draw", "training_seed"])["evaluation_seed"].nunique().mean())
+    starts = Estimate(*(float(value / a_run) for value in found["starts"]))
+    return Components(found["draws"], found["seeds"], starts)
+
+
+def _deviations(fit: MixedLMResults, parts: list[str]) -> dict[str, Estimate]:
+    """The standard deviation of each component and its interval."""
+    variances = {"draws": float(np.asarray(fit.cov_re)[0, 0]), **dict(zip(parts, map(float, fit.vcomp), strict=True))}
+    errors = dict(zip(variances, fit.bse.iloc[-len(variances) :], strict=True))
+    return {name: _deviation(variance, errors[name] * fit.scale) for name, variance in variances.items()}
+
+
+def _deviation(variance: float, error: float) -> Estimate:
+    """The root of a variance with this standard error, and its interval."""
+    if variance <= 0 or not np.isfinite(error):
+        return Estimate(float(np.sqrt(max(variance, 0))), 0.0, float("inf"))
+    factor = float(np.exp(NORMAL * error / (2 * variance)))
+    value = float(np.sqrt(variance))
+    return Estimate(value, value / factor, value * factor)
