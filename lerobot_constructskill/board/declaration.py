@@ -23,6 +23,9 @@ Hash = Annotated[str, Pattern("[0-9a-f]{64}", "a SHA-256 in hexadecimal digits")
 OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
 """What a policy sees: an `obs_type`, the simulator's own state (an expert), or nothing at all."""
 
+DRAWS = {"shared": "one draw of demonstrations", "own": "a draw of demonstrations a seed"}
+"""What training seeds learnt from, as the board says it. An interval over seeds of one draw covers no other draw."""
+
 
 @dataclass(frozen=True)
 class About(Checked):
@@ -37,6 +40,8 @@ class About(Checked):
         training: how it was trained, and how its training seeds were chosen.
         compute: hardware of the training, and its duration.
         observes: one of `OBSERVES`.
+        demonstrations: whether all training seeds learnt from one draw of demonstrations, or each from its own; one of
+            `DRAWS`, and None where it is not said.
         url: where its checkpoints are.
         notes: anything else that a reader must know.
 
@@ -52,6 +57,7 @@ class About(Checked):
     training: Line
     compute: Line
     observes: Annotated[str, Among(OBSERVES)]
+    demonstrations: Annotated[str, Among(tuple(DRAWS))] | None = None
     url: Link | None = None
     notes: Line | None = None
 
@@ -59,6 +65,11 @@ class About(Checked):
     def is_policy(self) -> bool:
         """Whether it sees what a policy sees; what does not is a reference, a floor or a ceiling."""
         return self.observes in OBS_TYPES
+
+    @property
+    def draws(self) -> str:
+        """What the training seeds learnt from, in words."""
+        return DRAWS.get(self.demonstrations or "", "draws of demonstrations not said") if self.is_policy else ""
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from lerobot_constructskill.board.declaration import About
@@ -10,7 +11,7 @@ from lerobot_constructskill.board.protocol import BoardSetting, environment_key
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_environments, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_draws, read_environments, read_rows
 
 type Recorded = dict[int, list[Episode]]
 """Training seed to the episodes of its policy."""
@@ -76,6 +77,18 @@ def recorded_by_study(
         else:
             recorded[int(row.training_seed)] += read_recordings(path)
     return recorded, failures
+
+
+def with_draws(about: About, study: Path) -> About:
+    """What is said of a policy, with what its study's folder says of its demonstrations.
+
+    Raises:
+        InputError: the two contradict each other.
+    """
+    made = read_draws(study).demonstrations
+    if about.demonstrations not in (None, made):
+        raise InputError(f"about.demonstrations is {about.demonstrations}, but those of the study are {made}.")
+    return replace(about, demonstrations=made) if about.is_policy else about
 
 
 def _alike(

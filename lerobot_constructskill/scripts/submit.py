@@ -65,6 +65,7 @@ def submit(config: SubmitConfig) -> str:
             config.study, config.store, config.variant, settings, config.study_settings
         )
         failures = said | failures
+        about = from_recordings.with_draws(about, config.study)
     made = from_recordings.submit(config.root, about, config.suite, settings, recorded, failures)
     size = (config.root / EPISODES_FILE).stat().st_size
     return (

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from lerobot_constructskill.board.declaration import About
-from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit
+from lerobot_constructskill.board.declaration import DRAWS, About
+from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit, with_draws
 from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
@@ -180,6 +180,17 @@ def test_two_settings_of_a_study_that_evaluate_alike_are_never_mixed(study, tmp_
     assert len(piles[0]) == 2 and not failures
     with pytest.raises(InputError, match="has no setting 'nowhere'; it has: again, block"):
         recorded_by_study(study, store, "ours", {"block": CONTROL}, ["nowhere"])
+
+
+def test_what_training_seeds_learnt_from_is_said_by_their_study(study):
+    assert (ABOUT.draws, with_draws(ABOUT, study).draws) == ("draws of demonstrations not said", DRAWS["shared"])
+    said = yaml.safe_load((study / STUDY).read_text()) | {"demonstrations": "own"}
+    (study / STUDY).write_text(yaml.safe_dump(said))
+    assert with_draws(replace(ABOUT, demonstrations="own"), study).draws == DRAWS["own"]
+    with pytest.raises(InputError, match="demonstrations is shared, but those of the study are own"):
+        with_draws(replace(ABOUT, demonstrations="shared"), study)
+    expert = replace(ABOUT, observes="privileged")
+    assert with_draws(expert, study) == expert and not expert.draws
 
 
 def test_what_a_study_does_not_have_is_said(study, tmp_path):
