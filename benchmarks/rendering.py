@@ -1,6 +1,7 @@
 """RGB environment steps per second at 224 x 224: our scene, ours with original meshes, and PickCube-v1.
 
-Also ours as a Gymnasium environment with one of its two cameras rendered, and with both.
+Also ours as a Gymnasium environment with one of its two cameras rendered, and with both; and a step with one camera
+against what physics and the picture take of it.
 
 Ours are stepped through LeRobot's vector environment, PickCube-v1 as its users step it. All take turns, a block
 of steps each, so that a change of the machine's load meets all of them; each is measured by the clock and in CPU time,
@@ -58,18 +59,45 @@ def of_two_cameras(cameras: tuple[str, ...]):
     return lambda: env.step(action)
 
 
+def of_parts(parts: Timer):
+    """A step with one camera; `parts` adds up what the simulator's own calls for physics and the picture take."""
+    env = ConstructSkillEnv(
+        obs_type="pixels_agent_pos", cameras=("wrist",), light_robot=True, render_backend="cpu", episode_length=10_000
+    )
+    env.reset(seed=0)
+    scene, (camera,) = env.started().scene, env.started()._sensors.values()
+    for owner, name in ((scene, "step"), (scene, "update_render"), (camera, "capture"), (camera, "get_obs")):
+        setattr(owner, name, timed(getattr(owner, name), parts))
+    action = np.array([0, 0, 0, 1], dtype=np.float32)
+    return lambda: env.step(action)
+
+
+def timed(function, timer: Timer):
+    def call(*args, **kwargs):
+        with timer:
+            return function(*args, **kwargs)
+
+    return call
+
+
 def measure(threads: str) -> None:
+    parts = Timer()
     steps = {"ours": ours(True), "original meshes": ours(False), "PickCube-v1": pick_cube()}
     steps |= {"one camera": of_two_cameras(("wrist",)), "two cameras": of_two_cameras(("base", "wrist"))}
+    steps |= {"in parts": of_parts(parts)}
     timers = {name: (Timer(), CpuTimer()) for name in steps}
     for step in steps.values():
         step()
+    parts.seconds = 0.0
     for _ in range(BLOCKS):
         for name, step in steps.items():
             clock, cpu = timers[name]
             with clock, cpu:
                 for _ in range(STEPS):
                     step()
+    n, whole = BLOCKS * STEPS, timers["in parts"][0].seconds
+    what, alone = f"ms of an environment's step, one camera, {threads}", "of these, physics and the picture"
+    report(what, 1000 * whole / n, alone, 1000 * parts.seconds / n, less_is_better=True)
     for which, unit in enumerate(("steps/s by the clock", "steps per second of CPU time")):
         rates = {name: BLOCKS * STEPS / pair[which].seconds for name, pair in timers.items()}
         what = f"RGB environment {unit}, {threads}"

@@ -268,15 +268,17 @@ class ConstructSkillEnv(gym.Env):
     @one_thread()
     def observations(self, obs: dict[str, Any]) -> dict[str, Any]:
         """The observation of every copy, arrays (num_copies, ...), without the noise of a perturbed sensor."""
-        seen = {"pixels": {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in self.cameras}}
+        pictures = {name: obs["sensor_data"][name]["rgb"].cpu().numpy() for name in self.cameras}
+        # Without the gaps of a fourth channel a picture is sent to another process faster; channel by channel it is
+        # copied three times as fast as pixel by pixel.
+        seen = {"pixels": {name: np.stack([*np.moveaxis(rgb, -1, 0)], axis=-1) for name, rgb in pictures.items()}}
         if self.obs_type == "pixels_agent_pos":
             seen["agent_pos"] = self.started().agent_state().cpu().numpy().astype(np.float32)
         return seen
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
         seen = self.observations(obs)
-        # Contiguous: an array with gaps takes four times as long to be sent to another process.
-        pixels = {name: self._sensed(name, np.ascontiguousarray(one[0])) for name, one in seen["pixels"].items()}
+        pixels = {name: self._sensed(name, one[0]) for name, one in seen["pixels"].items()}
         return {name: one[0] for name, one in seen.items() if name != "pixels"} | {"pixels": pixels}
 
     def _sensed(self, camera: str, image: np.ndarray) -> np.ndarray:
