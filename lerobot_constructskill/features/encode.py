@@ -1,6 +1,7 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +165,7 @@ def _encode_frames(
     with Progress(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
         for episode in missing:
             batches = []
-            for images in _batches(dataset, key, episode, batch_size):
+            for images in _ahead(_batches(dataset, key, episode, batch_size)):
                 batches.append(_encode(encoder, images, patches))
                 progress.update(len(images))
             pooled, tokens = zip(*batches, strict=True)
@@ -228,6 +229,15 @@ def _batches(dataset: LeRobotDataset, key: str, episode: dict, batch_size: int) 
             yield decode_video_frames(path, times, dataset.tolerance_s, return_uint8=True)
         else:
             yield torch.stack(dataset.hf_dataset[list(rows)][key]) * 255
+
+
+def _ahead[Item](items: Iterator[Item]) -> Iterator[Item]:
+    """Yield items of which the next one is made meanwhile, in another thread: a video is decoded on one core."""
+    with ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(next, items, None)
+        while (item := coming.result()) is not None:
+            coming = thread.submit(next, items, None)
+            yield item
 
 
 def _forget_videos(root: Path) -> None:
