@@ -393,7 +393,7 @@ def test_other_policies_accept_our_features_under_the_names_they_know(kind, writ
     config = train_config(written(kind), f"--output_dir={tmp_path / 'out'}", *base)
     config.validate()
     policy, task = config.policy, get_task("brick_to_bin")
-    columns = demonstration_features(task, "pixels_agent_pos")
+    columns = demonstration_features(task, ["base", "wrist"])
     features = dataset_to_policy_features(columns)
     policy.output_features = {"action": features.pop("action")}
     policy.input_features = policy.input_features or features

@@ -59,7 +59,7 @@ class MergedSet(Node):
             self._add_columns(base, first)
             aggregate(repo_id, [first, *driven], folder, Path(scratch))
         write_statistics(folder)
-        write_meanings(folder, get_task(config.task), config.obs_type)
+        write_meanings(folder, get_task(config.task), config.seen)
         facts = MADE.read(base.root / SIDECAR)
         facts["dagger"] = {
             "policy": self.rounds[0].policy.learner.facts(),
@@ -70,14 +70,14 @@ class MergedSet(Node):
         write_sidecar(folder, facts)
 
     def _add_columns(self, base: LeRobotDataset, folder: Path) -> None:
-        task, obs_type = get_task(self.base.config.task), self.base.config.obs_type
-        columns, frames = dagger_features(task, obs_type), base.num_frames
+        task, cameras = get_task(self.base.config.task), self.base.config.seen
+        columns, frames = dagger_features(task, cameras), base.num_frames
         values = {
             "dagger.round": np.zeros((frames, 1), dtype=np.int64),
             "dagger.actor": np.full((frames, 1), EXPERT, dtype=object),
             "dagger.hopeless": np.zeros((frames, 1), dtype=bool),
         }
-        added = columns.keys() - demonstration_features(task, obs_type).keys()
+        added = columns.keys() - demonstration_features(task, cameras).keys()
         modify_features(
             base, {name: (values[name], columns[name]) for name in sorted(added)}, None, folder, base.repo_id
         )

@@ -70,7 +70,7 @@ class Plan:
             "episode_length": self.config.max_steps or get_task(base.task).horizon,
             "light_robot": light_robot,
             "render_backend": backend,
-        }
+        } | ({"cameras": base.seen} if base.cameras else {})
 
     def data(self, number: int) -> Demonstrations | MergedSet:
         """What policy `number` is trained on: the demonstrations and the first `number` rounds."""

@@ -125,7 +125,7 @@ class Round(Node):
             with staged(shards / str(episode.seed)) as shard:
                 shard.mkdir()
                 if episode.frames:
-                    features = dagger_features(task, config.obs_type)
+                    features = dagger_features(task, config.seen)
                     write_episode(repo_id, task, features, episode.frames, shard / EPISODE, config.video)
                 outcome = json.dumps(asdict(DrivenEpisode.of(episode)))
                 (shard / OUTCOME).write_text(outcome + "\n", encoding="utf-8")

@@ -109,10 +109,11 @@ def render(facts: dict[str, Any]) -> str:
     """The card of a data set with these facts, in Markdown with the Hub's front matter."""
     task = get_task(facts["generator"]["task"])
     columns = dagger_features if "dagger" in facts else demonstration_features
-    features = columns(task, facts["generator"]["obs_type"])
+    seen = facts["generator"].get("cameras") or OBS_TYPES[facts["generator"]["obs_type"]]
+    features = columns(task, seen)
     if not facts.get("joints"):
         features = as_before_joints(features)
-    cameras = [CAMERAS[name] for name in OBS_TYPES[facts["generator"]["obs_type"]]]
+    cameras = [CAMERAS[name] for name in seen]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return render_template(
         "card.md.j2",

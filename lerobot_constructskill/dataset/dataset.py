@@ -128,7 +128,7 @@ class DataSet:
         A set without any column of joints was made before joints were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
-        features = made(get_task(self.config.task), self.config.obs_type)
+        features = made(get_task(self.config.task), self.config.seen)
         return features if self.has_joints else as_before_joints(features)
 
     @property

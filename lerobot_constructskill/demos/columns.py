@@ -4,9 +4,10 @@ Every LeRobot policy consumes each `observation.*` column and predicts each `act
 bear those names.
 """
 
+from collections.abc import Iterable
 from typing import Any, TypedDict
 
-from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, OBS_TYPES, SIM_STATE, STATE_NAMES, Task
+from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, SIM_STATE, STATE_NAMES, Task
 from lerobot_constructskill.files import Json
 
 ACTORS = EXPERT, LEARNER = "expert", "learner"
@@ -31,10 +32,10 @@ VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["heig
 """The column of a camera."""
 
 
-def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
-    """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen as `obs_type`."""
+def demonstration_features(task: Task, cameras: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen by `cameras`."""
     return {
-        **{CAMERAS[name].key: dict(VIDEO) for name in OBS_TYPES[obs_type]},
+        **{CAMERAS[name].key: dict(VIDEO) for name in cameras},
         "observation.state": _column("float32", *STATE_NAMES),
         "action": _column("float32", *task.action_names),
         "dart.executed_action": _column("float32", *task.action_names),
@@ -48,9 +49,9 @@ def demonstration_features(task: Task, obs_type: str) -> dict[str, dict[str, Any
     }
 
 
-def dagger_features(task: Task, obs_type: str) -> dict[str, dict[str, Any]]:
+def dagger_features(task: Task, cameras: Iterable[str]) -> dict[str, dict[str, Any]]:
     """The columns of `demonstration_features`, and those that say who acted."""
-    return demonstration_features(task, obs_type) | {
+    return demonstration_features(task, cameras) | {
         "dagger.round": _column("int64", "round"),
         "dagger.actor": _column("string", "actor"),
         "dagger.hopeless": _column("bool", "hopeless"),

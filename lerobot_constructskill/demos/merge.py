@@ -46,7 +46,7 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
     with tempfile.TemporaryDirectory(dir=shards) as scratch, room_for(folder):
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
-    write_meanings(folder, get_task(config.task), config.obs_type)
+    write_meanings(folder, get_task(config.task), config.seen)
     facts = {
         "generator": generator_facts(config) | {"light_robot": attempts[0].light_robot},
         "noise_covariance": (config.noise.root @ config.noise.root).tolist(),

@@ -1,11 +1,12 @@
 """What stands beside the frames of a data set: GR00T's `meta/modality.json`, our `meta/contract.json`, and hashes."""
 
 import json
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.artifacts.digests import file_sha256, files_below
-from lerobot_constructskill.contract import CAMERAS, GRIPPER, OBS_TYPES, ROTATION, STATE_NAMES, TRANSLATION, Task
+from lerobot_constructskill.contract import CAMERAS, GRIPPER, ROTATION, STATE_NAMES, TRANSLATION, Task
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.interface import describe_task
 
@@ -19,18 +20,18 @@ STATE_PARTS = {
 ACTION_PARTS = {"end_effector_position": TRANSLATION, "end_effector_rotation": ROTATION, "gripper": (GRIPPER,)}
 
 
-def write_meanings(root: Path, task: Task, obs_type: str) -> None:
-    """Write both files of a data set of `task` seen as `obs_type`."""
-    for name, content in ((MODALITY, modality(task, obs_type)), (CONTRACT, describe_task(task, OBS_TYPES[obs_type]))):
+def write_meanings(root: Path, task: Task, cameras: Collection[str]) -> None:
+    """Write both files of a data set of `task` seen by `cameras`."""
+    for name, content in ((MODALITY, modality(task, cameras)), (CONTRACT, describe_task(task, cameras))):
         (root / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def modality(task: Task, obs_type: str) -> dict[str, Any]:
-    """GR00T's file for a data set of `task` seen as `obs_type`: which numbers belong together."""
+def modality(task: Task, cameras: Iterable[str]) -> dict[str, Any]:
+    """GR00T's file for a data set of `task` seen by `cameras`: which numbers belong together."""
     return {
         "state": _spans(STATE_PARTS, STATE_NAMES),
         "action": _spans(ACTION_PARTS, task.action_names),
-        "video": {name: {"original_key": CAMERAS[name].key} for name in OBS_TYPES[obs_type]},
+        "video": {name: {"original_key": CAMERAS[name].key} for name in cameras},
         "annotation": {"human.task_description": {"original_key": "task_index"}},
     }
 

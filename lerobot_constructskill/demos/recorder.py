@@ -14,7 +14,7 @@ from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.disk import disk_of
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.pools import open_pool
-from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP, OBS_TYPES
+from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
 from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, attempt, whole
@@ -104,7 +104,7 @@ def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
 
 def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
-    images = config.episodes * config.max_steps * len(OBS_TYPES[config.obs_type])
+    images = config.episodes * config.max_steps * len(config.seen)
     needed = 2 * VIDEOS[config.video].bytes_per_image * images
     disk = disk_of(root.parent)
     free = shutil.disk_usage(disk).free

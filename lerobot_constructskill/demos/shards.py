@@ -61,22 +61,24 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     """
     task = get_task(config.task)
     expert = make_expert(task, config.expert)
-    env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot)
+    env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot, config.seen)
     frames, success = demonstrate(env, expert, config.noise, seed, config.labels, config.stop_at_success)
     outcome = Attempt(seed, success, len(frames), env.light_robot, env.backend)
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
         if success:
-            features = demonstration_features(task, config.obs_type)
+            features = demonstration_features(task, config.seen)
             write_episode(config.repo_id, task, features, frames, shard / EPISODE, config.video)
         (shard / OUTCOME).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
     return outcome
 
 
 @cache
-def _environment(task: str, obs_type: str, max_steps: int, light_robot: bool | None) -> ConstructSkillEnv:
+def _environment(
+    task: str, obs_type: str, max_steps: int, light_robot: bool | None, cameras: tuple[str, ...]
+) -> ConstructSkillEnv:
     """The simulator of this process. Its episodes do not depend on each other; a new one compiles shaders for 6 s."""
-    return ConstructSkillEnv(task, obs_type, max_steps, light_robot)
+    return ConstructSkillEnv(task, obs_type, max_steps, light_robot, cameras=cameras)
 
 
 def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> list[Kind]:

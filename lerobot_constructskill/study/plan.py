@@ -116,6 +116,10 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
         check_inputs(learner.config, common["env"]["obs_type"])
     first, episodes = common["evaluation"]["seed"], common["evaluation"]["episodes"]
     starts = {"demonstrations": data.node.starts, "evaluation": range(first, first + episodes)}
+    camera, recorded = getattr(learner.config, "camera", None), data.node.config.seen
+    if camera not in (None, *recorded):
+        seen = ", ".join(recorded)
+        raise InputError(f"variants.{name}.policy: it reads camera '{camera}', but {data.name} is recorded by {seen}.")
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
     with _inside(f"variants.{name}"):

@@ -105,7 +105,7 @@ def scenario_study(root: Path) -> None:
         raise ValueError("no simulator here")
 
     runs._agent = no_agents
-    runs._lost = lambda job, nodes: {}
+    runs._lost = lambda job, stage, nodes: {}
     Store.note = lambda *_: None  # a log says when
     policy = {"type": "act", "pretrained_backbone_weights": None}
     setting = Setting("smoke", {"obs_type": "pixels_agent_pos"})
@@ -128,7 +128,7 @@ def scenario_generate(root: Path) -> None:
 
     def demonstrate(env, expert, noise, seed, labels, stop_at_success):
         rng = np.random.default_rng(seed)
-        features = demonstration_features(get_task("brick_to_bin"), "pixels")
+        features = demonstration_features(get_task("brick_to_bin"), ["base"])
         return [{name: invent(feature, rng) for name, feature in features.items()} for _ in range(3)], True
 
     def invent(feature, rng):

@@ -130,7 +130,7 @@ def test_an_episode_ends_where_the_expert_knows_no_way_and_those_frames_are_drop
 
 def test_a_frame_has_the_columns_of_a_data_set():
     frame = drive(0.5)[SEEDS[0]].frames[0]
-    assert frame.keys() == dagger_features(TASK, "pixels").keys()
+    assert frame.keys() == dagger_features(TASK, ["base"]).keys()
 
 
 @pytest.mark.parametrize(

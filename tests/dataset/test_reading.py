@@ -45,7 +45,7 @@ def number_on(image: np.ndarray) -> int:
 
 def write(video: str, root: Path) -> LeRobotDataset:
     """Four episodes, each in a shard, merged as a generation and a round of DAgger merge theirs."""
-    features = {name: demonstration_features(TASK, "pixels")[name] for name in (CAMERA, "action")}
+    features = {name: demonstration_features(TASK, ["base"])[name] for name in (CAMERA, "action")}
     rows, shards = iter(range(sum(LENGTHS))), []
     for episode, length in enumerate(LENGTHS):
         frames = [{CAMERA: picture(next(rows)), "action": np.zeros(4, np.float32)} for _ in range(length)]

@@ -22,8 +22,8 @@ class ToyEnv:
 
     light_robot, backend = True, "none"
 
-    def __init__(self, task, obs_type, episode_length, light_robot=None):
-        self.cameras, self.episode_length = OBS_TYPES[obs_type], episode_length
+    def __init__(self, task, obs_type, episode_length, light_robot=None, cameras=None):
+        self.cameras, self.episode_length = cameras or OBS_TYPES[obs_type], episode_length
 
     def reset(self, seed):
         self.seed, self.steps, self.settled, self.lifted = seed, 0, 0, False

@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from commands import call
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import _CameraEncoderThread
@@ -118,6 +119,23 @@ def test_labels_are_what_was_executed_or_is_advised_where_that_is_asked_for():
         assert (one["action"][:3] != one["dart.executed_action"][:3]).all()
 
 
+def test_a_set_of_one_camera_is_the_set_of_both_without_the_other(recorded, tmp_path):
+    both, frames = recorded
+    root = tmp_path / "set"
+    record(GenerateConfig("local/one", str(root), episodes=1, obs_type="pixels_agent_pos", cameras=["wrist"]))
+    one, data = LeRobotDataset("local/one", root=root), open_dataset(root)
+    assert one.meta.camera_keys == ["observation.images.wrist"]
+    for name, values in one.hf_dataset.with_format("numpy")[:].items():
+        np.testing.assert_array_equal(values, frames[name][: len(values)], err_msg=name)
+    assert torch.equal(one[5]["observation.images.wrist"], both[5]["observation.images.wrist"])
+    assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
+    assert replay_episode(data, 0) == (True, 0.0)
+    call("constructskill-card", f"--root={root}")
+    card = (root / "README.md").read_text()
+    assert "--policy.camera=wrist --env.obs_type=pixels_agent_pos \\\n    --env.type" in card
+    assert "observation.images.wrist" in card and "`observation.images.base`" not in card
+
+
 def test_a_lossless_set_has_every_pixel_as_it_was_rendered_and_the_same_bytes_on_any_number_of_cores(tmp_path):
     config = GenerateConfig("local/exact", str(tmp_path / "set"), episodes=2, video="lossless")
     _, attempts = record(config)
@@ -136,7 +154,7 @@ def test_a_lossless_set_has_every_pixel_as_it_was_rendered_and_the_same_bytes_on
         np.testing.assert_array_equal(seen, frame[key])
     data = open_dataset(dataset.root)
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
-    features, cores = demonstration_features(TASKS[config.task], config.obs_type), os.sched_getaffinity(0)
+    features, cores = demonstration_features(TASKS[config.task], config.seen), os.sched_getaffinity(0)
     try:
         for name, some in (("one", {min(cores)}), ("all", cores)):
             os.sched_setaffinity(0, some)
@@ -156,7 +174,7 @@ def test_how_the_set_was_made_travels_with_it(demonstrations):
 @pytest.mark.parametrize("in_the_end", [True, False])
 def test_a_video_that_lerobot_gives_up_is_an_error(tmp_path, monkeypatch, in_the_end):
     """Its encoder stands still for longer than LeRobot waits, and then goes on at once, or too late."""
-    columns, go_on = demonstration_features(TASKS["brick_to_bin"], "pixels_agent_pos"), threading.Event()
+    columns, go_on = demonstration_features(TASKS["brick_to_bin"], ["base", "wrist"]), threading.Event()
     features = {name: columns[name] for name in ("observation.images.base", "observation.images.wrist", "action")}
     frame = {name: np.zeros(feature["shape"], np.float32) for name, feature in features.items()}
     encode, join = _CameraEncoderThread.run, threading.Thread.join
@@ -205,6 +223,8 @@ def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
         (["--workers=0"], "workers"),
         (["--episodes=0"], "episodes"),
         (["--obs_type=rgb"], "pixels_agent_pos"),
+        (["--cameras=[wrist]"], "cameras must be some of base, which pixels has, not wrist."),
+        (["--obs_type=pixels_agent_pos", "--cameras=[]"], "base, wrist, which pixels_agent_pos has, not none."),
         (["--config_path=/dev/null"], "'/dev/null' is not a regular file."),
     ],
 )

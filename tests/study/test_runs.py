@@ -691,6 +691,13 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
             "variants.a.policy: .*heads from the start",
         ),
         ({"variants": {"a": Variant({"type": "pi9"})}}, "variants.a.policy: .*pi9"),
+        (
+            {
+                "settings": {"fixed": Setting("fast_wrist --cameras=[wrist]", ENV)},
+                "variants": {"a": Variant({"type": "frozen_vit", "backbone": "dinov2_vits14"})},
+            },
+            r"variants.a.policy: it reads camera 'base', but fast_wrist --cameras=\[wrist\] is recorded by wrist",
+        ),
         ({"variants": {"a": Variant(ACT | {"chunk_sise": 5})}}, "variants.a.policy: .*chunk_sise"),
         (
             {"variants": {"a": Variant(ACT | {"chunk_size": 5})}},
