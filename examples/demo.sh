@@ -30,7 +30,7 @@ with_bar() {
 }
 
 say "Demonstrations: 50 of the brick task by the scripted expert, with noise (the simulators start: 10 seconds)"
-[ -d "$OUT/demonstrations" ] || constructskill-generate precise/brick_to_bin_shifted --episodes=50 \
+[ -d "$OUT/demonstrations" ] || constructskill-generate precise/brick_to_bin_shifted --episodes=50 '--cameras=[wrist]' \
     --repo_id=local/shifted --root="$OUT/demonstrations" --workers="$(nproc)"
 
 say "Features: every frame once through the frozen encoder, inner layers of EfficientNet-Lite0"
