@@ -6,7 +6,7 @@ import torch
 
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
-from lerobot_constructskill.threads import one_thread
+from lerobot_constructskill.threads import one_thread, threads
 
 
 @pytest.fixture(autouse=True)
@@ -58,3 +58,10 @@ def test_the_simulator_runs_in_one_thread_and_leaves_the_rest_to_its_user(monkey
             call()
         assert torch.get_num_threads() == 3
     assert stand_in.seen == [1] * 7
+
+
+def test_what_compiles_within_the_block_is_told_the_threads_outside():
+    before = threads()
+    with one_thread():
+        assert torch.get_num_threads() == 1 and threads() == before
+    assert torch.get_num_threads() == before == threads()

@@ -23,7 +23,7 @@ Hash = Annotated[str, Pattern("[0-9a-f]{64}", "a SHA-256 in hexadecimal digits")
 OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
 """What a policy sees: an `obs_type`, the simulator's own state (an expert), or nothing at all."""
 
-DRAWS = {"shared": "one draw of demonstrations", "own": "a draw of demonstrations a seed"}
+DRAWS = {"shared": "one draw of demonstrations", "own": "draws of demonstrations of their own"}
 """What training seeds learnt from, as the board says it. An interval over seeds of one draw covers no other draw."""
 
 

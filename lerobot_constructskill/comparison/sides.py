@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from glob import glob
 from itertools import chain
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import pandas as pd
@@ -19,6 +20,7 @@ from lerobot_constructskill.study.rows import (
     NOT_RUN,
     ROWS,
     STUDY,
+    Draws,
     check_folder,
     read_draws,
     read_environments,
@@ -50,7 +52,8 @@ class Side:
         env: keyword arguments of the `ConstructSkillEnv` that it was evaluated in.
         seeds: placements of each training seed; None for a seed whose training or evaluation failed.
         versions: packages, processor and simulator that its episodes were made with.
-        covered: what an interval over its seeds covers, as `study.rows.Draws.covered`; None if that is not known.
+        draws: which training seeds share demonstrations; None if that is not known.
+        numbers: the training seeds' numbers, in the order of `seeds`; empty if they are not known.
     """
 
     name: str
@@ -58,7 +61,20 @@ class Side:
     env: Mapping[str, Any]
     seeds: list[Placements | None]
     versions: dict[str, str]
-    covered: str | None = None
+    draws: Draws | None = None
+    numbers: Sequence[int] = ()
+
+    @property
+    def covered(self) -> str | None:
+        """What intervals over its seeds, or draws of several, cover; None if that is not known."""
+        return self.draws.covered if self.draws else None
+
+    def by_draw(self, rates: Sequence[float]) -> list[float]:
+        """One rate for each draw of demonstrations: seeds of one draw are alike, and count once."""
+        of = [self.draws.of(number) for number in self.numbers] if self.draws else []
+        if not 1 < len(set(of)) < len(of):
+            return list(rates)
+        return [fmean(rate for rate, draw in zip(rates, of, strict=True) if draw == one) for one in dict.fromkeys(of)]
 
     @property
     def starts_apart(self) -> list[set[int]] | None:
@@ -66,7 +82,7 @@ class Side:
         each = [set(placed) for placed in self.seeds if placed]
         different = {frozenset(starts) for starts in each}
         apart = len(different) > 1 and sum(map(len, different)) == len(set.union(*each))
-        return each if apart and len(each) == len(self.seeds) else None
+        return each if apart and len(each) == len(self.seeds) and len({*map(len, each)}) == 1 else None
 
     @property
     def starts(self) -> set[int] | None:
@@ -202,7 +218,8 @@ def read_study(root: Path, arm: str) -> Side:
         env=envs[setting],
         seeds=[_placements_of_rows(own) for _, own in rows.groupby("training_seed", sort=True)],
         versions=merge_versions(_versions(text, backend) for text, backend in made_with),
-        covered=read_draws(root).covered,
+        draws=read_draws(root),
+        numbers=sorted(int(number) for number in rows["training_seed"].unique()),
     )
 
 

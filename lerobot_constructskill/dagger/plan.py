@@ -62,7 +62,7 @@ class Plan:
             InputError: the policy reads what the base does not show.
         """
         base = self.base.config
-        check_inputs(self.learner.config, base.obs_type)
+        check_inputs(self.learner.config, base.obs_type, base.seen)
         light_robot, backend = resolve_rendering(base.light_robot)
         return {
             "task": base.task,

@@ -132,11 +132,15 @@ def render(facts: dict[str, Any]) -> str:
     )
 
 
+IN_PI0 = {"base": "base_0_rgb", "wrist": "left_wrist_0_rgb"}
+"""Our cameras and those of pi0's base models."""
+
+
 def _rename_map(keys: list[str]) -> dict[str, str]:
     """Our cameras under the names that SmolVLA's and pi0's base models expect."""
     smolvla = {key: f"observation.images.camera{index + 1}" for index, key in enumerate(keys)}
-    pi0 = dict(zip(keys, ("observation.images.base_0_rgb", "observation.images.left_wrist_0_rgb"), strict=False))
-    return {"smolvla": json.dumps(smolvla), "pi0": json.dumps(pi0)}
+    pi0 = {CAMERAS[name].key: f"observation.images.{theirs}" for name, theirs in IN_PI0.items()}
+    return {"smolvla": json.dumps(smolvla), "pi0": json.dumps({key: pi0[key] for key in keys if key in pi0})}
 
 
 def render_template(template: str, **facts: Any) -> str:

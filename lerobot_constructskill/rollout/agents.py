@@ -142,10 +142,9 @@ class PolicyAgent:
         self._step += 1
         device = torch.device(self.policy.config.device)
         amp = torch.autocast(device.type, enabled=self.policy.config.use_amp)
-        on_gpu = device.type == "cuda"
-        # Without a GPU, torch.manual_seed would note a stack trace for each kind of GPU, at every step.
-        seed_torch = torch.manual_seed if on_gpu else torch.default_generator.manual_seed
-        with torch.random.fork_rng([device] if on_gpu else []), amp, observing(batch, OFFERED):
+        # On a CPU, torch.manual_seed would note a stack trace for each kind of GPU at every step.
+        seed_torch = torch.default_generator.manual_seed if device.type == "cpu" else torch.manual_seed
+        with torch.random.fork_rng([device] if device.type == "cuda" else []), amp, observing(batch, OFFERED):
             seed_torch(int(drawn))
             action = self.policy.select_action(batch)
         return self.postprocessor(action).squeeze(0).cpu().numpy()

@@ -1,6 +1,7 @@
-"""Many agents evaluated in lockstep: an environment each, and one encoder batch for all that share an encoder.
+"""Many agents evaluated in lockstep, with an environment each.
 
-They step in two halves: the environments of one are at work while the agents of the other act.
+They step in two halves: the environments of one are at work while the agents of the other act. Those of a half that
+share an encoder have one batch of it.
 """
 
 import json
@@ -72,7 +73,7 @@ def roll_out(
             for numbers in _halves(range(len(agents)))
         ]
         bar.unpause()  # until now the simulators started
-        while any(group.running for group in groups):
+        while any(group.running or group.over for group in groups):
             for group in groups:
                 bar.update(group.advance())
                 yield from group.finished()

@@ -79,7 +79,8 @@ def _draws(study: Study, seeds: range, sets: dict[str, NamedSet]) -> Iterator[_D
     """The draws of some training seeds of a setting with these demonstrations.
 
     Raises:
-        InputError: demonstrations could begin as an evaluation episode of any draw does, or as those of another draw.
+        InputError: demonstrations could begin as an evaluation episode of one of these draws does, or as those of
+            another draw.
     """
     first, last = (study.starts_of(study.draws.of(seed)) for seed in (seeds[0], seeds[-1]))
     for number, own in groupby(seeds, key=study.draws.of):
@@ -113,13 +114,9 @@ def _drawn(draw: int, data: NamedSet) -> NamedSet:
 def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, common: Mapping[str, Any]) -> Arm:
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
-        check_inputs(learner.config, common["env"]["obs_type"])
+        check_inputs(learner.config, common["env"]["obs_type"], data.node.config.seen)
     first, episodes = common["evaluation"]["seed"], common["evaluation"]["episodes"]
     starts = {"demonstrations": data.node.starts, "evaluation": range(first, first + episodes)}
-    camera, recorded = getattr(learner.config, "camera", None), data.node.config.seen
-    if camera not in (None, *recorded):
-        seen = ", ".join(recorded)
-        raise InputError(f"variants.{name}.policy: it reads camera '{camera}', but {data.name} is recorded by {seen}.")
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
     with _inside(f"variants.{name}"):

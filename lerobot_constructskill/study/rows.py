@@ -79,10 +79,10 @@ class Draws:
     def covered(self) -> str:
         """What intervals over the study's runs cover."""
         if self.demonstrations == SHARED:
-            return "training seeds alone: all share one draw of demonstrations and one list of starts"
+            return "other training seeds alone, with the same draw of demonstrations and the same starts"
         if self.starts == SHARED:
-            return "draws of demonstrations and training seeds: all share one list of starts"
-        return "draws of demonstrations, lists of starts and training seeds"
+            return "other draws of demonstrations and training seeds, from the same starts"
+        return "other draws of demonstrations, starts and training seeds"
 
 
 class _Settings(TypedDict):

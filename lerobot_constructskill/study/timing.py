@@ -17,8 +17,8 @@ TIMINGS = "timings.jsonl"
 """File in a study's folder."""
 
 STAGES = ("demonstrations", "data", "training", "evaluation", "validation")
-"""In the order of a study: demonstrations; what policies learn from, made of them (features, the rounds of DAgger);
-checkpoints; episodes; held-out errors."""
+"""In the order of a study: demonstrations; what policies learn from, made of them (features); checkpoints, with what
+else is made for them, such as rounds of DAgger; episodes; held-out errors."""
 
 OF_A_RUN = STAGES[1:4]
 """Stages that a study's plan counts for each run. Demonstrations it names apart."""

@@ -1,7 +1,7 @@
 """Checkpoints as nodes of a store: a policy, trained on demonstrations with one seed or several."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -27,11 +27,16 @@ ACTING = (*LEARNING, "mani_skill", "sapien")
 """Packages whose versions may show in what any agent does."""
 
 
-def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
-    """Refuse a policy that reads what it would not be shown where it acts.
+def check_inputs(policy: PreTrainedConfig, obs_type: str, recorded: Sequence[str] | None = None) -> None:
+    """Refuse a policy that reads what it would not be shown where it acts, or learns.
+
+    Args:
+        obs_type: of the environment in which it acts.
+        recorded: the cameras of the demonstrations; None where it does not learn.
 
     Raises:
-        InputError: it reads the state, and observations have pictures alone, or a camera that they do not have.
+        InputError: it reads the state, and observations have pictures alone, or a camera that they, or the
+            demonstrations, do not have.
     """
     # LeRobot gives a policy that does not name its inputs all of the data set; its own types read the state in it.
     unsaid = getattr(policy, "use_state", type(policy).__module__.startswith("lerobot."))
@@ -42,6 +47,10 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str) -> None:
     if camera not in (None, *shown):
         raise InputError(
             f"The policy reads camera '{camera}'; where it acts, obs_type '{obs_type}' has {', '.join(shown)}."
+        )
+    if recorded is not None and camera not in (None, *recorded):
+        raise InputError(
+            f"The policy reads camera '{camera}'; the demonstrations are recorded by {', '.join(recorded)}."
         )
 
 

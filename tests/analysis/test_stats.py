@@ -332,7 +332,10 @@ def test_the_spread_is_split_as_an_analysis_of_variance_splits_it(deviations, rn
 def test_what_cannot_be_told_apart_is_not(rng):
     assert split(drawn_episodes(rng, 1, 4, 20, (0.1, 0.1, 0.1))) is None, "one draw"
     assert split(drawn_episodes(rng, 4, 1, 20, (0.1, 0.1, 0.1))) is None, "a seed a draw"
-    assert split(drawn_episodes(rng, 4, 2, 20, (0.1, 0.1, 0.1)).assign(met=True)) is None, "all alike"
+    episodes = drawn_episodes(rng, 4, 2, 20, (0.1, 0.1, 0.1))
+    assert split(episodes.assign(met=True)) is None, "all alike"
+    assert split(episodes.assign(met=episodes["training_seed"] % 2 == 0)) is None, "a seed does it always or never"
+    assert split(episodes.assign(evaluation_seed=episodes["evaluation_seed"] % 20)) is None, "draws share starts"
 
 
 def test_a_failed_run_is_a_seed_that_did_not_meet_the_criterion_and_a_missing_run_is_not():

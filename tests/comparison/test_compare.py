@@ -94,11 +94,13 @@ def test_starts_are_those_in_common(study):
 def test_rows_over_draws_are_not_compared_with_rows_of_one_draw_in_silence(study, recorded):
     own = {"demonstrations": "own"}
     one, drawn, theirs = study(GOOD), study(BAD, "drawn", draws=own), study(BAD, "theirs", draws=own)
-    assert "The intervals cover draws of demonstrations and training seeds" in tell(compared(drawn, theirs), 0.05)
+    assert "of other draws of demonstrations and training seeds, from the same starts" in tell(
+        compared(drawn, theirs), 0.05
+    )
     told = tell(compared(one, drawn), 0.05)
-    assert "A's interval covers training seeds alone" in told and "B's interval covers draws" in told
+    assert "A's interval is of other training seeds alone" in told and "B's interval is of other draws" in told
     assert "Demonstrations can make the difference" in told
-    assert "What A's covers, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
+    assert "What A's is of, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
 
 
 def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, checkpoints):
@@ -109,6 +111,15 @@ def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, 
     for other in (study(GOOD, "shared"), checkpoints(2)):
         with pytest.raises(InputError, match="Each draw of '.*' has starts of its own"):
             compared(study(GOOD, f"own {len(other)}", draws=own), other)
+
+
+def test_seeds_of_one_draw_count_as_one(study):
+    draws = {"demonstrations": "own", "seeds_a_draw": 2}
+    pairs, other = study([9, 7, 2, 2, 5, 5], draws=draws), study([5] * 6, "other", draws=draws)
+    judgement = compared(pairs, other).judgement
+    assert (judgement.counts_a.seeds, judgement.mean_a.value) == (3, pytest.approx(0.5))
+    alone = compared(study([8, 2, 5], "alone"), study([5] * 3, "three")).judgement
+    assert judgement.mean_a == pytest.approx(alone.mean_a) and judgement.p_value == alone.p_value
 
 
 def test_checkpoints_are_evaluated_where_the_other_side_was(study, checkpoints):

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_constructskill.artifacts.folders import MARK
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.features import encode as features_encode
-from lerobot_constructskill.features.encode import load_encoder
+from lerobot_constructskill.features.encode import _ahead, load_encoder
 from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.policies.frozen_vit import precision
@@ -369,3 +369,15 @@ def test_a_study_takes_the_weights_whose_hash_it_names_or_none(weights):
     assert settle(policy_config(weights, backbone_sha256=found))[0].backbone_sha256 == found
     with pytest.raises(InputError, match="weights asked for have sha256 000000000000, but local tiny.safetensors has"):
         settle(policy_config(weights, backbone_sha256="0" * 64))
+
+
+def test_frames_are_decoded_ahead_in_order_until_one_cannot_be():
+    def items():
+        yield from range(3)
+        raise OSError("a torn file")
+
+    seen = []
+    with pytest.raises(OSError, match="a torn file"):
+        for item in _ahead(items()):
+            seen.append(item)
+    assert seen == [0, 1, 2] and next(_ahead(iter([7, 8]))) == 7 and list(_ahead(iter([]))) == []

@@ -181,6 +181,15 @@ def test_agents_of_one_half_act_while_the_environments_of_the_other_are_at_work(
     assert meanwhile == {(mine, other) for mine in (0, 1) for other in (2, 3)} | {(2, 0), (2, 1), (3, 0), (3, 1)}
 
 
+def test_agents_that_all_fail_at_once_are_recorded():
+    class Unready:
+        def reset(self, seed):
+            raise RuntimeError("no beginning")
+
+    outcomes = dict(roll_out([Unready() for _ in range(3)], ENV, [SEEDS] * 3, n_workers=1))
+    assert len(outcomes) == 3 and all("no beginning" in str(one.error) for one in outcomes.values())
+
+
 class Looking(Broken):
     """Notes the cameras that it is shown."""
 

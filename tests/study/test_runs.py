@@ -696,7 +696,7 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
                 "settings": {"fixed": Setting("fast_wrist --cameras=[wrist]", ENV)},
                 "variants": {"a": Variant({"type": "frozen_vit", "backbone": "dinov2_vits14"})},
             },
-            r"variants.a.policy: it reads camera 'base', but fast_wrist --cameras=\[wrist\] is recorded by wrist",
+            "variants.a.policy: The policy reads camera 'base'; the demonstrations are recorded by wrist",
         ),
         ({"variants": {"a": Variant(ACT | {"chunk_sise": 5})}}, "variants.a.policy: .*chunk_sise"),
         (

@@ -102,12 +102,12 @@ def draws_figure(setting: SettingFindings, episodes: int) -> Figure:
     """Episodes of each run that placed, by draw of demonstrations: a mark a training seed, a bar their mean."""
     figure, axes = _panels(2.6, 1, len(setting.drawn), sharey=True)
     for axis, one in zip(axes, setting.drawn, strict=True):
-        by_draw = [runs["placed"] for _, runs in one.runs.groupby("draw", sort=False)]
-        for number, placed in enumerate(by_draw):
+        by_draw = {draw: runs["placed"] for draw, runs in one.runs.groupby("draw")}
+        for number, placed in enumerate(by_draw.values()):
             axis.hlines(placed.mean(), number - 0.3, number + 0.3, color=MUTED)
             beside = number + np.linspace(-0.15, 0.15, len(placed)) * (len(placed) > 1)
             axis.plot(beside, placed, "o", color="#1d5b94", markeredgecolor="white")
-        axis.set_xticks(range(len(by_draw)))
+        axis.set_xticks(range(len(by_draw)), [*by_draw])
         axis.set(title=fill(one.label, 40), xlabel="draw of demonstrations")
     axes[0].set(ylabel=f"placed of {episodes}", ylim=(-0.06 * episodes, 1.06 * episodes))
     return figure

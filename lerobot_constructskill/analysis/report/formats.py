@@ -35,9 +35,9 @@ def points_range(estimate: Estimate) -> str:
 
 
 def deviation(estimate: Estimate) -> str:
-    """A standard deviation of shares in points: "6.1 (3.2–11.4)"; of one that is 0, "0"."""
+    """A standard deviation of shares in points: "6.1 (3.2–11.4)", or "0.4 (not determined)": none is above 0.5."""
     value, low, high = (f"{100 * share:.1f}" for share in estimate)
-    return f"{value} ({low}–{high})" if estimate.high < float("inf") else "0"
+    return f"{value} ({low}–{high})" if estimate.high <= 0.5 else f"{value} (not determined)"
 
 
 def p_value(p: float) -> str:

@@ -54,7 +54,7 @@ def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws = Draws()) ->
         alpha=analysis.alpha,
         episodes=int(rows["episodes"].iloc[0]),
         first_seed=int(rows["evaluation_seed"].min()),
-        last_seed=int(rows["evaluation_seed"].max()),
+        last_seed=int((rows["evaluation_seed"] - rows["episode"] + rows["episodes"] - 1).max()),
         planned=int(of_variants.sum()),
         planned_references=int((~of_variants).sum()),
         missing=int((planned["error_kind"] == NOT_RUN).sum()),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from statsmodels.regression.mixed_linear_model import MixedLM, MixedLMResults
-from statsmodels.tools.sm_exceptions import ConvergenceWarning
+from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 
@@ -38,19 +38,28 @@ def split(episodes: pd.DataFrame) -> Components | None:
         episodes: a row an episode: `draw`, `training_seed`, `evaluation_seed` and whether it succeeded, `met`.
 
     Returns:
-        None where they cannot be told apart: fewer than two draws, no draw with two seeds, or all ended alike.
+        None where they cannot be told apart: fewer than two draws, no draw with two seeds, draws that share starts, or
+        episodes that all ended alike, or as their draw, seed or start alone says.
     """
     seeds = episodes.groupby("draw")["training_seed"].nunique()
-    if len(seeds) < 2 or seeds.max() < 2 or episodes["met"].nunique() < 2:
+    shared = episodes.groupby("evaluation_seed")["draw"].nunique().max() > 1 if len(episodes) else False
+    if len(seeds) < 2 or seeds.max() < 2 or shared or episodes["met"].nunique() < 2:
         return None
     told = episodes.astype({"draw": int, "training_seed": int, "evaluation_seed": int, "met": float})
     parts = {"seeds": "0 + C(training_seed)", "starts": "0 + C(evaluation_seed)"}
     model = MixedLM.from_formula("met ~ 1", told, re_formula="1", vc_formula=parts, groups="draw")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # of a component at 0, which its interval says
-        warnings.simplefilter("ignore", RuntimeWarning)
-        fit = model.fit(reml=True, method="powell")  # others stop short where a component is 0
+        for of_a_component_at_0 in (ConvergenceWarning, SingularMatrixWarning, RuntimeWarning):
+            warnings.simplefilter("ignore", of_a_component_at_0)  # which its interval says
+        try:
+            fit = model.fit(reml=True, method="powell")  # others stop short where a component is 0
+        except np.linalg.LinAlgError:  # nothing is left beside the components
+            return None
         found = _deviations(fit, model.exog_vc.names)
+    if not np.isfinite([one.value for one in found.values()]).all():
+        return None
+    if not np.isfinite([one.value for one in found.values()]).all():
+        return None
     a_run = np.sqrt(episodes.groupby(["draw", "training_seed"])["evaluation_seed"].nunique().mean())
     starts = Estimate(*(float(value / a_run) for value in found["starts"]))
     return Components(found["draws"], found["seeds"], starts)

@@ -1,4 +1,4 @@
-"""Policies that share an encoder: each step's frames go through it together, and every frame only once."""
+"""Policies that share an encoder: frames of those that act together go through it together, and each only once."""
 
 import hashlib
 from collections.abc import Hashable, Mapping, Sequence
