@@ -63,14 +63,13 @@ def filming() -> float:
 def in_turn() -> float:
     """Steps per second of one policy in this process, where encoder, heads and simulator work one after another."""
     agent = PolicyAgent.from_pretrained(OUT / "checkpoints" / "seed_0", "cpu")
-    env = ConstructSkillEnv()
+    env, timer = ConstructSkillEnv(), Timer()
     shown, _ = env.reset(seed=1000)
     for step in range(STEPS):
         if step == WARM:  # the encoder is compiled for its first picture
             timer = Timer()
-            timer.__enter__()
-        shown, *_ = env.step(agent.act(Observation(shown, env.privileged_state(), "")))
-    timer.__exit__()
+        with timer:
+            shown, *_ = env.step(agent.act(Observation(shown, env.privileged_state(), "")))
     env.close()
     return (STEPS - WARM) / timer.seconds
 
@@ -86,9 +85,7 @@ def main() -> None:
     note = f"the same without the {1000 * frame:.0f} ms a step that its video takes"
     report(what, steps / seconds, baseline, stock_steps / (stock_seconds - frame * stock_steps), 4, note)
     note = "start-up counted for the ten policies alone"
-    report(
-        what, steps / seconds, "one policy in one process: encoder, heads and simulator in turn", in_turn(), None, note
-    )
+    report(what, steps / seconds, "one policy in one process, its parts in turn", in_turn(), note=note)
 
 
 if __name__ == "__main__":

@@ -78,8 +78,6 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
     if apart := _starts_apart(list(sides.values())):
         if asked.episodes:
             raise InputError("Draws of these sides have starts of their own: leave out --episodes.")
-        if asked.episodes:
-            raise InputError("Draws of these sides have starts of their own: leave out --episodes.")
         starts, episodes, either = sorted(set.union(*apart)), len(apart[0]), set.union(*apart)
     else:
         starts = _common_starts(sides.values(), asked)
@@ -91,7 +89,7 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
         [_rate([placed[start] for start in starts if start in placed]) if placed else 0.0 for placed in side.seeds]
         for side in (sides[a], sides[b])
     )
-    judgement = judge(np.array(sides[a].by_draw(rates_a)), np.array(sides[b].by_draw(rates_b)), alpha)
+    judgement = judge(sides[a].units(rates_a), sides[b].units(rates_b), alpha)
     return MatchedSides(
         sides[a], sides[b], conditions(env), starts, episodes, len(either), rates_a, rates_b, judgement
     )

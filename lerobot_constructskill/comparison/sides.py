@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from glob import glob
 from itertools import chain
 from pathlib import Path
-from statistics import fmean
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from lerobot_constructskill.analysis.stats.outcomes import by_draw
 from lerobot_constructskill.contract import OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError, plural
@@ -69,12 +70,9 @@ class Side:
         """What intervals over its seeds, or draws of several, cover; None if that is not known."""
         return self.draws.covered if self.draws else None
 
-    def by_draw(self, rates: Sequence[float]) -> list[float]:
-        """One rate for each draw of demonstrations: seeds of one draw are alike, and count once."""
-        of = [self.draws.of(number) for number in self.numbers] if self.draws else []
-        if not 1 < len(set(of)) < len(of):
-            return list(rates)
-        return [fmean(rate for rate, draw in zip(rates, of, strict=True) if draw == one) for one in dict.fromkeys(of)]
+    def units(self, rates: Sequence[float]) -> np.ndarray:
+        """The rates that a comparison counts, of each training seed or, where these are known, of each draw."""
+        return by_draw(rates, [self.draws.of(number) for number in self.numbers]) if self.draws else np.array(rates)
 
     @property
     def starts_apart(self) -> list[set[int]] | None:

@@ -108,9 +108,9 @@ def _covered(matched: MatchedSides) -> str:
     """What the intervals are over, and that the sides differ in it."""
     a, b = matched.a.covered, matched.b.covered
     if a == b:
-        return f"The intervals say what further runs would give, of {a}." if a else ""
-    told = {letter: f"{letter}'s interval is of {one}." for letter, one in (("A", a), ("B", b)) if one}
-    missing = [f"What {letter}'s is of, its files do not say." for letter in "AB" if letter not in told]
+        return f"The intervals hold for {a}." if a else ""
+    told = {letter: f"{letter}'s interval holds for {one}." for letter, one in (("A", a), ("B", b)) if one}
+    missing = [f"What {letter}'s holds for, its files do not say." for letter in "AB" if letter not in told]
     return " ".join([*told.values(), *missing, "Demonstrations can make the difference as well as policies."])
 
 

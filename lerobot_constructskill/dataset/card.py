@@ -140,7 +140,7 @@ def _rename_map(keys: list[str]) -> dict[str, str]:
     """Our cameras under the names that SmolVLA's and pi0's base models expect."""
     smolvla = {key: f"observation.images.camera{index + 1}" for index, key in enumerate(keys)}
     pi0 = {CAMERAS[name].key: f"observation.images.{theirs}" for name, theirs in IN_PI0.items()}
-    return {"smolvla": json.dumps(smolvla), "pi0": json.dumps({key: pi0[key] for key in keys if key in pi0})}
+    return {"smolvla": json.dumps(smolvla), "pi0": json.dumps({key: pi0[key] for key in keys})}
 
 
 def render_template(template: str, **facts: Any) -> str:

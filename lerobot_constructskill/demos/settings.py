@@ -113,14 +113,10 @@ def check_apart(starts: Mapping[str, range]) -> None:
 
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:
     """The settings that a data set records: all but where and how fast it was generated."""
-    left_out = {
-        "root",
-        "workers",
-        "executor",
-        *([] if config.cameras else ["cameras"]),
-    }  # as before there was a choice
-    facts = {name: value for name, value in asdict(config).items() if name not in left_out}
-    return facts | ({"cameras": list(config.seen)} if config.cameras else {})
+    facts = {name: value for name, value in asdict(config).items() if name not in ("root", "workers", "executor")}
+    if not config.cameras:
+        del facts["cameras"]  # so that sets from before there was a choice keep their digests
+    return facts
 
 
 def frames_digest(config: GenerateConfig) -> str:

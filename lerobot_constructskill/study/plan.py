@@ -46,12 +46,12 @@ def list_runs(study: Study) -> list[Run]:
         common = {"setting": name, "env": env, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
             for draw in _draws(study, range(count), sets):
-                arm = _reference_arm(study, reference, draw.sets, common | {"evaluation": draw.evaluation})
+                arm = _reference_arm(study, reference, draw.sets, common | {"starts": draw.starts})
                 runs += [Run(arm, seed) for seed in draw.seeds]
         for variant_name, variant in study.variants_in(name).items():
             for draw in _draws(study, variant.training_seeds, sets):
                 data = draw.sets[study.data_for(name, variant)]
-                arm = _variant_arm(study, variant_name, variant, data, common | {"evaluation": draw.evaluation})
+                arm = _variant_arm(study, variant_name, variant, data, common | {"starts": draw.starts})
                 runs += [Run(arm, seed) for seed in draw.seeds]
     return runs
 
@@ -70,10 +70,6 @@ class _Draw:
     sets: dict[str, NamedSet]
     starts: range
 
-    @property
-    def evaluation(self) -> dict[str, int]:
-        return {"seed": self.starts.start, "episodes": len(self.starts)}
-
 
 def _draws(study: Study, seeds: range, sets: dict[str, NamedSet]) -> Iterator[_Draw]:
     """The draws of some training seeds of a setting with these demonstrations.
@@ -83,14 +79,14 @@ def _draws(study: Study, seeds: range, sets: dict[str, NamedSet]) -> Iterator[_D
             another draw.
     """
     first, last = (study.starts_of(study.draws.of(seed)) for seed in (seeds[0], seeds[-1]))
+    if study.demonstrations == OWN:
+        for one in sets.values():
+            _check_room(one)
     for number, own in groupby(seeds, key=study.draws.of):
         drawn = {name: _drawn(number, one) for name, one in sets.items()} if number else sets
-        if study.demonstrations == OWN:
-            for one in sets.values():
-                _check_room(one)
         for one in drawn.values():
-            evaluated = range(first.start, last.stop)
-            check_apart({f"demonstrations '{one.name}'": one.node.starts, "evaluation": evaluated})
+            evaluated = {"evaluation": range(first.start, last.stop)}
+            check_apart({f"demonstrations '{one.name}'": one.node.starts} | evaluated)
         yield _Draw([*own], drawn, study.starts_of(number))
 
 
@@ -115,8 +111,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
         check_inputs(learner.config, common["env"]["obs_type"], data.node.config.seen)
-    first, episodes = common["evaluation"]["seed"], common["evaluation"]["episodes"]
-    starts = {"demonstrations": data.node.starts, "evaluation": range(first, first + episodes)}
+    starts = {"demonstrations": data.node.starts, "evaluation": common["starts"]}
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
     with _inside(f"variants.{name}"):
@@ -147,11 +142,11 @@ def _reference_arm(study: Study, name: str, sets: Mapping[str, NamedSet], common
     role = REFERENCE if reference.looks else SIGHTLESS
     if reference.policy:
         base, variant = _variant_with(study, name, reference, setting)
+        data = sets[study.data_for(setting, variant)]
         with _inside(f"references.{name}"):
             learner = Learner.of({**variant.policy, **reference.policy})
-            check_inputs(learner.config, common["env"]["obs_type"])
+            check_inputs(learner.config, common["env"]["obs_type"], data.node.config.seen)
         training = _training_of(study, setting, base, variant)
-        data = sets[study.data_for(setting, variant)]
         return Arm(name=name, role=role, demonstrations=data, learner=learner, training=training, **common)
     data = sets[study.settings[setting].data] if reference.reads_demonstrations else None
     return Arm(name=name, role=role, demonstrations=data, **common | {"validated_on": ()})

@@ -77,12 +77,12 @@ class Draws:
 
     @property
     def covered(self) -> str:
-        """What intervals over the study's runs cover."""
+        """What intervals over the study's runs hold for."""
         if self.demonstrations == SHARED:
-            return "other training seeds alone, with the same draw of demonstrations and the same starts"
+            return "other training seeds, with the same demonstrations and starts"
         if self.starts == SHARED:
-            return "other draws of demonstrations and training seeds, from the same starts"
-        return "other draws of demonstrations, starts and training seeds"
+            return "other draws of demonstrations and other training seeds, from the same starts"
+        return "other draws of demonstrations, other starts and other training seeds"
 
 
 class _Settings(TypedDict):

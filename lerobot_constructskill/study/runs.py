@@ -63,7 +63,7 @@ class Arm:
     Args:
         setting, name, role: as in `rows.Row`.
         env: keyword arguments of `ConstructSkillEnv`.
-        evaluation: `seed` of the first episode, and how many `episodes`.
+        starts: seeds of the evaluation episodes.
         demonstrations: what it learns from or replays, if it does.
         validated_on: all demonstrations of its setting, those that every seed would share.
         learner: what is trained; None for references that are not.
@@ -75,7 +75,7 @@ class Arm:
     name: str
     role: str
     env: dict[str, Any]
-    evaluation: dict[str, int]
+    starts: range
     demonstrations: NamedSet | None = None
     validated_on: tuple[NamedSet, ...] = ()
     learner: Learner | None = None
@@ -85,11 +85,6 @@ class Arm:
     @property
     def id(self) -> str:
         return f"{self.setting}/{self.name}"
-
-    @property
-    def starts(self) -> range:
-        """Seeds of the evaluation episodes."""
-        return range(self.evaluation["seed"], self.evaluation["seed"] + self.evaluation["episodes"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +102,8 @@ class Run(Node):
 
     def facts(self) -> dict[str, Any]:
         reference = {} if self.arm.learner else {"reference": self.arm.name}
-        return {**reference, "seed": self.seed, "environment": self.arm.env, "evaluation": self.arm.evaluation}
+        evaluation = {"seed": self.arm.starts.start, "episodes": len(self.arm.starts)}
+        return {**reference, "seed": self.seed, "environment": self.arm.env, "evaluation": evaluation}
 
     def versions(self) -> dict[str, str]:
         task = get_task(self.arm.env["task"])
@@ -285,7 +281,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
     return EpisodeRow(
         run=run.digest,
         training_seed=run.seed,
-        evaluation_seed=arm.evaluation["seed"],
+        evaluation_seed=arm.starts.start,
         episode=0,
         dataset_sha256=_dataset_sha256(job, run),
         weights_sha256=weights,

@@ -124,7 +124,7 @@ class Table:
             return rows
         if failed := self._rows_before(run, failed=True):
             return [replace(row, **_names(run)) for row in failed]
-        seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.evaluation["seed"]}
+        seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.starts.start}
         return [Row(run=run.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))]
 
     def _heldout_errors(self, run: Run) -> dict[str, Any]:
@@ -157,6 +157,6 @@ def _names(run: Run) -> dict[str, Any]:
         "setting": arm.setting,
         "variant": arm.name,
         "role": arm.role,
-        "episodes": arm.evaluation["episodes"],
+        "episodes": len(arm.starts),
         "demonstrations": arm.demonstrations and arm.demonstrations.name,
     }

@@ -32,6 +32,7 @@ from lerobot_constructskill.analysis.report.summarize import summarize
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.report import ReportConfig, report
+from lerobot_constructskill.study.rows import Draws
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -54,7 +55,7 @@ class Reader(HTMLParser):
 
 def findings_of(study: dict, rows, folder: Path, **analysis):
     _, section, table = read_study(write_study(folder, study, rows, **analysis))
-    return summarize(section, table)
+    return summarize(section, table, Draws())
 
 
 @pytest.fixture
@@ -244,8 +245,11 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
         of = drawn if shared else drawn | {"demonstrations": "own", "starts": "own", "seeds_a_draw": 2}
         write_study(root, of, rows)
         said[shared] = report(ReportConfig(root)) and (root / "report.md").read_text()
-    assert "of other training seeds alone" in said[True] and "draws.png" not in said[True]
-    assert "of other draws of demonstrations, starts and training seeds" in said[False]
+    assert (
+        "hold for other training seeds, with the same demonstrations and starts" in said[True]
+        and "draws.png" not in said[True]
+    )
+    assert "hold for other draws of demonstrations, other starts and other training seeds" in said[False]
     assert "What the spread between runs is made of" in said[False] and "figures/fixed_draws.png" in said[False]
     mean = {shared: re.search(r"5\.8 \(([\d.]+)–([\d.]+)\)", text).groups() for shared, text in said.items()}
     assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])

@@ -94,13 +94,13 @@ def test_starts_are_those_in_common(study):
 def test_rows_over_draws_are_not_compared_with_rows_of_one_draw_in_silence(study, recorded):
     own = {"demonstrations": "own"}
     one, drawn, theirs = study(GOOD), study(BAD, "drawn", draws=own), study(BAD, "theirs", draws=own)
-    assert "of other draws of demonstrations and training seeds, from the same starts" in tell(
+    assert "hold for other draws of demonstrations and other training seeds, from the same starts" in tell(
         compared(drawn, theirs), 0.05
     )
     told = tell(compared(one, drawn), 0.05)
-    assert "A's interval is of other training seeds alone" in told and "B's interval is of other draws" in told
+    assert "A's interval holds for other training seeds, with" in told and "B's interval holds for other draws" in told
     assert "Demonstrations can make the difference" in told
-    assert "What A's is of, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
+    assert "What A's holds for, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
 
 
 def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, checkpoints):

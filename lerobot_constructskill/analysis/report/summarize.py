@@ -19,12 +19,12 @@ from lerobot_constructskill.analysis.stats.comparisons import compare
 from lerobot_constructskill.analysis.stats.components import Components, split
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_draw, count, runs_of
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Draws
 
 
-def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws = Draws()) -> Findings:  # noqa: B008  immutable
+def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws) -> Findings:
     """Compute what a report says. The same rows give the same numbers, including resampled intervals.
 
     Args:
@@ -155,9 +155,7 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
 def _success(runs: pd.DataFrame, criterion: str) -> Success:
     rates = _rates(runs, criterion)
     counts = count(rates)
-    several = 1 < runs["draw"].nunique() < len(runs)  # draws with several seeds, which are alike
-    units = runs.groupby("draw")[f"{criterion}_rate"].mean().to_numpy() if several else rates
-    mean = mean_rate(units)._replace(value=float(rates.mean()))
+    mean = mean_rate(by_draw(rates, runs["draw"]))._replace(value=float(rates.mean()))
     return Success(counts, clopper_pearson(counts), mean, float(rates.std()))
 
 

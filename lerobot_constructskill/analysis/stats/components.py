@@ -58,8 +58,6 @@ def split(episodes: pd.DataFrame) -> Components | None:
         found = _deviations(fit, model.exog_vc.names)
     if not np.isfinite([one.value for one in found.values()]).all():
         return None
-    if not np.isfinite([one.value for one in found.values()]).all():
-        return None
     a_run = np.sqrt(episodes.groupby(["draw", "training_seed"])["evaluation_seed"].nunique().mean())
     starts = Estimate(*(float(value / a_run) for value in found["starts"]))
     return Components(found["draws"], found["seeds"], starts)

@@ -4,6 +4,7 @@ The seed is the sample. Episodes are counted within their run and never pooled o
 episodes of a run repeat one trajectory (paper, section III).
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -50,6 +51,17 @@ def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
     for column in ("heldout_mse_m2_by_data", "error_kind", "error"):
         runs[column] = groups[column].first()
     return runs.reset_index()
+
+
+def by_draw(rates: Sequence[float] | np.ndarray, draws: Sequence[int]) -> np.ndarray:
+    """Mean of the rates of each draw of demonstrations, whose seeds are alike; where all share one draw, the rates.
+
+    Args:
+        rates: share in [0, 1] of the episodes of each seed, (seeds,).
+        draws: the draw that each seed learnt from.
+    """
+    found = pd.Series(rates, dtype=float).groupby(list(draws), sort=False).mean().to_numpy()
+    return found if len(found) > 1 else np.asarray(rates, dtype=float)
 
 
 def count(rates: np.ndarray) -> Counts:

@@ -4,7 +4,6 @@ import json
 import logging
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -308,7 +307,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         inputs = self.head_inputs(batch)
-        with one_thread() if self.backbone.device.type == "cpu" else nullcontext():
+        with one_thread():
             return self.heads(*inputs)[0]
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
