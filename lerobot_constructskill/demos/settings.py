@@ -33,8 +33,8 @@ class GenerateConfig:
         episodes: successful demonstrations to record.
         obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera). The state is always
             recorded.
-        cameras: those of `obs_type` that are rendered and recorded, such as `[wrist]`; all by default. One of two is
-            made faster and takes half the disk.
+        cameras: those of `obs_type` that are rendered and recorded, such as `[wrist]`; all by default. One of two
+            takes less time and disk.
         max_steps: steps after which an attempt counts as failed.
         max_failures: failed attempts, as a fraction of `episodes`, above which the run gives up.
         seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
