@@ -61,6 +61,15 @@ POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 JOINTS = (*(f"panda_joint{number}" for number in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2")
 """The Panda's seven arm joints, in rad and rad/s, and its two fingers, in m and m/s, as its URDF names them."""
 
+MAX_PLACEMENTS = 9
+"""Most objects that one task places; the privileged state has room for so many in every task."""
+
+
+def _each(*names: str) -> tuple[str, ...]:
+    """`names` of every placement of a task, in order."""
+    return tuple(f"{name}_{number}" for number in range(MAX_PLACEMENTS) for name in names)
+
+
 SIM_STATE = {
     "tcp_pose": POSE,
     "fingers": ("finger_left", "finger_right"),
@@ -71,8 +80,30 @@ SIM_STATE = {
     "bin_interior": ("x", "y", "z"),
     "joint_positions": JOINTS,
     "joint_velocities": JOINTS,
+    "placement": ("number",),
+    "object_poses": _each(*POSE),
+    "object_sizes": _each("x", "y", "z"),
+    "object_masses": _each("mass"),
+    "bin_positions": _each("x", "y", "z"),
+    "bin_interiors": _each("x", "y", "z"),
+    "is_object": _each("is_object"),
+    "is_placed": _each("is_placed"),
 }
-"""Privileged state, name to the names of its numbers: SI units, world frame."""
+"""Privileged state, name to the names of its numbers: SI units, world frame.
+
+A task is a list of placements. `object_*` and `bin_*` are of the next one, which is the first that is not done, or the
+last of all; `placement` is its number. The plurals are of all placements, in order; `is_object` says which numbers
+there are, the others are 0.
+"""
+
+PLURALS = {
+    "object_pose": "object_poses",
+    "object_size": "object_sizes",
+    "object_mass": "object_masses",
+    "bin_position": "bin_positions",
+    "bin_interior": "bin_interiors",
+}
+"""Of `SIM_STATE`: what is said of the next placement, and of all."""
 
 DEMO_SEED_START, DEMO_SEED_STOP = 1_000_000, 2**30
 """First seed of data sets, and the one after their last. LeRobot's evaluations start at the training seed or at 1000,
@@ -140,6 +171,7 @@ SUITES = {
     "bins": ("brick_to_bin", "brick_to_bin_shifted", "block_to_bin"),
     "ladder": tuple(LADDER),
     "joints": ("brick_on_brick", "tile_to_grid", "tenon_to_mortise"),
+    "wall": ("course_of_three", "bond_of_five", "lintel_on_posts"),
 }
 """Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
 
@@ -168,6 +200,7 @@ class Task:
         noisy_yield: share of demonstrations under the default noise that succeed at least; the others are discarded,
             and a data set of a task below 0.5 needs a larger `max_failures`.
         is_brick: the object is a brick, whose size can be perturbed.
+        plan: the plan after which several objects are placed, a name in `configs/plan`; none where there is one.
     """
 
     name: str
@@ -179,6 +212,7 @@ class Task:
     action_names: tuple[str, ...] = (*TRANSLATION, GRIPPER)
     noisy_yield: float = 0.9
     is_brick: bool = False
+    plan: str | None = None
 
     def __post_init__(self):
         wrong = {
@@ -196,6 +230,7 @@ class Task:
 _PICK_PLACE = "lerobot_constructskill.demos.pick_place:PickPlaceExpert"
 _PRECISE = "lerobot_constructskill.demos.precise:PreciseExpert"
 _TURNING = "lerobot_constructskill.demos.precise:TurningExpert"
+_LAYING = "lerobot_constructskill.demos.laying:LayingExpert"
 _SCENES = "lerobot_constructskill.sim.tasks"
 
 BRICK = (0.21, 0.065, 0.10)
@@ -277,6 +312,36 @@ SHIPPED = {
             horizon=400,
             scene=f"{_SCENES}.tenon:TenonToMortiseEnv",
             expert=_PRECISE,
+        ),
+        Task(
+            name="course_of_three",
+            env_id="ConstructionCourseOfThree-v1",
+            instruction="Lay the three bricks end to end, with joints of ten millimetres.",
+            horizon=1200,
+            scene=f"{_SCENES}.wall:WallEnv",
+            expert=_LAYING,
+            noisy_yield=0.6,
+            plan="course_of_three",
+        ),
+        Task(
+            name="bond_of_five",
+            env_id="ConstructionBondOfFive-v1",
+            instruction="Lay three bricks end to end and the other two on their joints.",
+            horizon=2000,
+            scene=f"{_SCENES}.wall:WallEnv",
+            expert=_LAYING,
+            noisy_yield=0.6,
+            plan="bond_of_five",
+        ),
+        Task(
+            name="lintel_on_posts",
+            env_id="ConstructionLintelOnPosts-v1",
+            instruction="Set up the two posts and lay the beam across them.",
+            horizon=1200,
+            scene=f"{_SCENES}.wall:WallEnv",
+            expert=_LAYING,
+            noisy_yield=0.6,
+            plan="lintel_on_posts",
         ),
     )
 }

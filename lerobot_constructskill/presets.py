@@ -5,7 +5,7 @@ from pathlib import Path
 
 from lerobot_constructskill.errors import MissingError
 
-KINDS = ("dagger", "generate", "policy", "study", "train")
+KINDS = ("dagger", "generate", "plan", "policy", "study", "train")
 
 _PACKAGED = Path(__file__).parent / "configs"
 FOLDER = _PACKAGED if _PACKAGED.is_dir() else Path(__file__).parents[1] / "configs"

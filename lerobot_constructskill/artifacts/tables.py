@@ -29,12 +29,14 @@ class Parquet:
         kind: the dataclass.
         types: Arrow's type of each annotation that is no str, int, float or bool.
         json: columns that hold JSON.
+        added: fields that may be None and that older files lack.
     """
 
     what: str
     kind: type
     types: Mapping[Any, pa.DataType] = field(default_factory=dict)
     json: Mapping[str, Json] = field(default_factory=dict)
+    added: tuple[str, ...] = ()
 
     @cached_property
     def schema(self) -> pa.Schema:
@@ -51,7 +53,7 @@ class Parquet:
             MissingError: there is no such file.
             InputError: it is of another kind, or a value is missing.
         """
-        table = read_parquet(path, most=MOST)
+        table = self._completed(read_parquet(path, most=MOST))
         if not table.schema.equals(self.schema):
             raise InputError(f"'{path}' is not {self.what} of this version.")
         if not len(table):
@@ -63,3 +65,12 @@ class Parquet:
             for text in table[name].unique().drop_null().to_pylist():
                 kind.parse(text, f"{name} in '{path}'")
         return table
+
+    def _completed(self, table: pa.Table) -> pa.Table:
+        """A table that may be older than some columns, with these."""
+        if not (missing := [name for name in self.added if name not in table.column_names]):
+            return table
+        for name in missing:
+            table = table.append_column(self.schema.field(name), pa.nulls(len(table), self.schema.field(name).type))
+        names = [name for name in self.schema.names if name in table.column_names]
+        return table.select([*names, *(name for name in table.column_names if name not in self.schema.names)])

@@ -10,7 +10,7 @@ import numpy as np
 from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
 from lerobot_constructskill.dataset.dataset import DataSet, Provenance
-from lerobot_constructskill.demos.columns import SIDECAR, as_before_joints, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import SIDECAR, as_made, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.settings import generator_facts
 from lerobot_constructskill.errors import InputError
@@ -31,6 +31,14 @@ MEANINGS = {
     "sim.bin_interior": "privileged: the bin's inner edges, m",
     "sim.joint_positions": "privileged: the arm's seven joints (rad) and the two fingers (m)",
     "sim.joint_velocities": "privileged: velocities of the same joints (rad/s, m/s)",
+    "sim.placement": "privileged: number of the placement that object_* and bin_* above are of, the next one",
+    "sim.object_poses": "privileged: poses of all objects, in the order in which they are placed",
+    "sim.object_sizes": "privileged: edges of each, m",
+    "sim.object_masses": "privileged: mass of each, kg",
+    "sim.bin_positions": "privileged: where each goes, m, world frame",
+    "sim.bin_interiors": "privileged: inner edges of that, m",
+    "sim.is_object": "privileged: 1 for each object that there is, 0 for the rest of the nine",
+    "sim.is_placed": "privileged: 1 for each object that is placed",
     "sim.seed": "seed of the episode's initial state and noise",
     "dagger.round": "the round in which the frame came about, 0 for demonstrations",
     "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",
@@ -79,6 +87,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
         "episodes": len(lengths),
         "frames": len(data.rows),
         "joints": data.has_joints,
+        "placements": data.has_placements,
         "shortest": min(lengths),
         "longest": max(lengths),
         "held_out": held_out(len(lengths)),
@@ -110,9 +119,7 @@ def render(facts: dict[str, Any]) -> str:
     task = get_task(facts["generator"]["task"])
     columns = dagger_features if "dagger" in facts else demonstration_features
     seen = facts["generator"].get("cameras") or OBS_TYPES[facts["generator"]["obs_type"]]
-    features = columns(task, seen)
-    if not facts.get("joints"):
-        features = as_before_joints(features)
+    features = as_made(columns(task, seen), bool(facts.get("joints")), bool(facts.get("placements")))
     cameras = [CAMERAS[name] for name in seen]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return render_template(

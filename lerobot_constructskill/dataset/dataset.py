@@ -14,8 +14,9 @@ from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
 from lerobot_constructskill.contract import FPS, get_task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
+    PLACEMENT_COLUMNS,
     SIDECAR,
-    as_before_joints,
+    as_made,
     dagger_features,
     demonstration_features,
 )
@@ -125,15 +126,22 @@ class DataSet:
     def columns(self) -> dict[str, dict[str, Any]]:
         """The columns that the data set should have, with DAgger's if a learner drove.
 
-        A set without any column of joints was made before joints were recorded.
+        A set without any column of joints, or of placements, was made before these were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
         features = made(get_task(self.config.task), self.config.seen)
-        return features if self.has_joints else as_before_joints(features)
+        return as_made(features, self.has_joints, self.has_placements)
 
     @property
     def has_joints(self) -> bool:
-        return any(name in self.info["features"] or name in self.rows for name in JOINT_COLUMNS)
+        return self._has_any(JOINT_COLUMNS)
+
+    @property
+    def has_placements(self) -> bool:
+        return self._has_any(PLACEMENT_COLUMNS)
+
+    def _has_any(self, names: tuple[str, ...]) -> bool:
+        return any(name in self.info["features"] or name in self.rows for name in names)
 
     @cached_property
     def rounds(self) -> np.ndarray:

@@ -25,7 +25,22 @@ MADE = Json("the record of how a data set was made", _Made)
 """Reads the file `SIDECAR`."""
 
 JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
-"""Columns that older data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
+"""Columns that the oldest data sets lack; those sets also have no channel names in `sim.*` and `next.*`."""
+
+PLACEMENT_COLUMNS = tuple(
+    f"sim.{name}"
+    for name in (
+        "placement",
+        "object_poses",
+        "object_sizes",
+        "object_masses",
+        "bin_positions",
+        "bin_interiors",
+        "is_object",
+        "is_placed",
+    )
+)
+"""Columns that data sets lack which were made before a task was a list of placements."""
 
 
 VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
@@ -58,13 +73,14 @@ def dagger_features(task: Task, cameras: Iterable[str]) -> dict[str, dict[str, A
     }
 
 
-def as_before_joints(features: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The columns of data sets that are older than the recording of joints and the names of all channels."""
+def as_made(features: dict[str, dict[str, Any]], joints: bool, placements: bool) -> dict[str, dict[str, Any]]:
+    """The columns of a set that may be older than the recording of joints, or than that of lists of placements."""
+    missing = {*(() if joints else JOINT_COLUMNS), *(() if placements else PLACEMENT_COLUMNS)}
     named = ("observation.", "action", "dart.")
     return {
-        name: feature if name.startswith(named) else feature | {"names": None}
+        name: feature if joints or name.startswith(named) else feature | {"names": None}
         for name, feature in features.items()
-        if name not in JOINT_COLUMNS
+        if name not in missing
     }
 
 

@@ -31,11 +31,13 @@ class ExpertProgress:
         phase: the phase of the next action.
         steps: actions already issued in that phase.
         anchor: position of the end effector when the phase began, (3,) metres.
+        number: the placement that it works on.
     """
 
     phase: Phase
     steps: int
     anchor: np.ndarray
+    number: int = 0
 
 
 Gain = Annotated[float, Range(above=0, most=100)]

@@ -53,14 +53,19 @@ class PickPlaceExpert:
     config: ExpertConfig
 
     def start(self, state: PrivilegedState) -> ExpertProgress:
-        return ExpertProgress(PHASES[0], 0, state.tcp)
+        return ExpertProgress(PHASES[0], 0, state.tcp, state.number)
 
     def act(self, state: PrivilegedState, progress: ExpertProgress) -> tuple[np.ndarray, Phase, ExpertProgress | None]:
-        while self._is_over(state, progress):
-            progress = ExpertProgress(PHASES[PHASES.index(progress.phase) + 1], 0, state.tcp)
-        action = self._action(state, progress).astype(np.float32)
+        own = state.at(progress.number)
+        while self._is_over(own, progress):
+            progress = replace(progress, phase=PHASES[PHASES.index(progress.phase) + 1], steps=0, anchor=own.tcp)
+        action = self._action(own, progress).astype(np.float32)
         after = replace(progress, steps=progress.steps + 1)
-        return action, progress.phase, None if self._is_last(state, after) else after
+        if not self._is_last(own, after):
+            return action, progress.phase, after
+        # With the next placement it begins anew; one that it missed it does not mend.
+        goes_on = state.number != progress.number and not state.is_done
+        return action, progress.phase, self.start(state) if goes_on else None
 
     def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
         """Whether the demonstration is over with the action that led to `after`."""
@@ -183,10 +188,13 @@ class PickPlaceExpert:
             at_grasp = self._is_over(state, self._beginning(Phase.DESCEND, state))
             phase = Phase.GRASP if at_grasp else Phase.DESCEND
             return self._act_in(phase, state), phase
-        obstacle = state.obstacle if state.crosses_bin(grasp) else state.top
-        rising = float(np.clip((obstacle + 2 * RISEN - state.tcp[2]) / RISEN, 0, 1))
+        rising = float(np.clip((self._obstacle(state, grasp) + 2 * RISEN - state.tcp[2]) / RISEN, 0, 1))
         over = self._act_in(Phase.PREGRASP, state)
         return rising * self._straight_up(state) + (1 - rising) * over, Phase.PREGRASP
+
+    def _obstacle(self, state: PrivilegedState, grasp: np.ndarray) -> float:
+        """Height in metres of what stands in the way of an empty hand that goes to `grasp`."""
+        return state.obstacle if state.crosses_bin(grasp) else state.top
 
     def _straight_up(self, state: PrivilegedState) -> np.ndarray:
         action = 0 * self._act_in(Phase.PREGRASP, state)

@@ -5,6 +5,7 @@ lowers it and opens the jaws; noise has no part in it unless `noise.release_sigm
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,9 +13,6 @@ from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_
 from lerobot_constructskill.demos.expert import ExpertProgress, Phase
 from lerobot_constructskill.demos.pick_place import GRAVITY, PickPlaceExpert
 from lerobot_constructskill.demos.state import OPENED, PrivilegedState
-
-RELEASE_GAP = 0.003
-"""Height in metres over the floor of the receptacle from which an object may drop."""
 
 TIP_CLEARANCE = 0.02
 """Distance in metres from the TCP down to the rim that open fingers keep; their tips are 9 mm below it."""
@@ -57,6 +55,9 @@ SEATED = 0.008
 class PreciseExpert(PickPlaceExpert):
     """Closes the loop on the object's pose from CARRY on."""
 
+    release_gap: ClassVar[float] = 0.003
+    """Height in metres over the floor of the receptacle from which an object may drop."""
+
     def _is_over(self, state: PrivilegedState, progress: ExpertProgress) -> bool:
         is_centred = (abs(self._grasp_point(state) - state.tcp) < CENTRED).all()
         return super()._is_over(state, progress) and bool(is_centred or progress.phase is not Phase.DESCEND)
@@ -77,26 +78,36 @@ class PreciseExpert(PickPlaceExpert):
     def _release(self, state: PrivilegedState) -> np.ndarray:
         # Down to the floor, or to where the fingers would meet the rim.
         lowest = max(state.floor, state.rim + TIP_CLEARANCE - (state.object_size[2] - self.config.finger_depth))
-        gap = lowest - _underside(state)
+        gap = lowest - self._underside(state)
         if min(state.fingers) > OPENED:
             return np.array([0, 0, self.config.max_step, GRIPPER_OPEN])
-        if gap > -RELEASE_GAP:
+        if gap > -self.release_gap:
             return np.array([0, 0, 0, GRIPPER_OPEN])
         error = self._carry_error(state)
         haste = self._haste(state, error)
-        error[2] = haste * (gap - RELEASE_GAP) + (1 - haste) * error[2]
+        error[2] = haste * (gap - self.release_gap) + (1 - haste) * error[2]
         step = np.clip(ALIGNING_GAIN * error, -LOWERING_STEP, LOWERING_STEP)
+        return np.array([*self._hold_up(step, state), GRIPPER_CLOSED])
+
+    def _hold_up(self, step: np.ndarray, state: PrivilegedState) -> np.ndarray:
+        """The translation that moves an arm by `step`, (3,) metres, which the held object draws down and in."""
         radius = (state.tcp - ROBOT_BASE) * [1, 1, 0]
         outward = DRAWN_IN * GRAVITY * state.object_mass[0] * radius / np.linalg.norm(radius)
-        return np.array([*step + self._weight_compensation(state) + outward, GRIPPER_CLOSED])
+        return step + self._weight_compensation(state) + outward
 
     def _haste(self, state: PrivilegedState, error: np.ndarray) -> float:
         """How fast to lower, 0 to 1: not at all outside a funnel over the opening, and gradually from its wall on."""
-        gap = _underside(state) - state.rim
+        gap = self._underside(state) - state.rim
         if gap < -INSERTED:
             return 1.0
         accepted = np.clip(_play(state) / 2, FINEST, COARSEST) + FUNNEL * max(gap, 0)
         return float(np.clip(1.5 - abs(error[:2]) / accepted, 0, 1).min())
+
+    def _underside(self, state: PrivilegedState) -> float:
+        """Height of the object's lowest corner in metres, in float32 as recorded demonstrations have it."""
+        w, x, y, z = state.object_pose[3:]
+        ends = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+        return state.object_pose[2] - abs(ends) @ state.object_size / 2
 
     # Advice
 
@@ -166,13 +177,6 @@ def yaw_of(pose: np.ndarray) -> np.ndarray:
 def _half_turn(angle: float) -> float:
     """`angle` in radians, less whole half turns: within a quarter turn of zero."""
     return (angle + np.pi / 2) % np.pi - np.pi / 2
-
-
-def _underside(state: PrivilegedState) -> float:
-    """Height of the object's lowest corner in metres, in float32 as recorded demonstrations have it."""
-    w, x, y, z = state.object_pose[3:]
-    ends = np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    return state.object_pose[2] - abs(ends) @ state.object_size / 2
 
 
 def _play(state: PrivilegedState) -> np.ndarray:

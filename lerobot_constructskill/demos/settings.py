@@ -15,6 +15,7 @@ from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.plans.plan import read_plan
 
 LABELS = ("clean", "executed", "advice")
 
@@ -130,9 +131,11 @@ def frames_digest(config: GenerateConfig) -> str:
 
 
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
-    """The encoder's options and the columns, on which a data set depends beside its settings."""
-    columns = demonstration_features(get_task(config.task), config.seen)
-    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)}
+    """The encoder's options, the columns and the plan, on which a data set depends beside its settings."""
+    task = get_task(config.task)
+    columns = demonstration_features(task, config.seen)
+    plan = {} if task.plan is None else {"plan": read_plan(task.plan).facts()}
+    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)} | plan
 
 
 def frame_versions(task: str) -> dict[str, str]:

@@ -1,6 +1,7 @@
 """What an expert knows: the simulator's state, and how object, hand and receptacle stand to each other in it."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +37,7 @@ MARGIN = 0.01
 class PrivilegedState:
     """The simulator's state as `contract.SIM_STATE` names it: float arrays, SI units, world frame.
 
-    Data sets made before the joints were recorded have none of them.
+    Data sets made before the joints, or the lists of placements, were recorded have none of them.
     """
 
     tcp_pose: np.ndarray
@@ -48,6 +49,47 @@ class PrivilegedState:
     bin_interior: np.ndarray
     joint_positions: np.ndarray | None = None
     joint_velocities: np.ndarray | None = None
+    placement: np.ndarray | None = None
+    object_poses: np.ndarray | None = None
+    object_sizes: np.ndarray | None = None
+    object_masses: np.ndarray | None = None
+    bin_positions: np.ndarray | None = None
+    bin_interiors: np.ndarray | None = None
+    is_object: np.ndarray | None = None
+    is_placed: np.ndarray | None = None
+
+    @property
+    def number(self) -> int:
+        """The number of the placement that `object_*` and `bin_*` are of."""
+        return 0 if self.placement is None else int(self.placement[0])
+
+    @property
+    def count(self) -> int:
+        """How many placements the task has."""
+        return 1 if self.is_object is None else int(self.is_object.sum())
+
+    @property
+    def is_done(self) -> bool:
+        """Whether every placement is done."""
+        return self.is_placed is not None and bool(self.is_placed[: self.count].all())
+
+    def at(self, number: int) -> "PrivilegedState":
+        """The same state with the placement `number` in place of the next one."""
+        if number == self.number:
+            return self
+        return replace(
+            self,
+            placement=np.array([number], np.float32),
+            object_pose=self.object_poses.reshape(-1, 7)[number],
+            object_size=self.object_sizes.reshape(-1, 3)[number],
+            object_mass=self.object_masses[number : number + 1],
+            bin_position=self.bin_positions.reshape(-1, 3)[number],
+            bin_interior=self.bin_interiors.reshape(-1, 3)[number],
+        )
+
+    def others(self) -> Iterator["PrivilegedState"]:
+        """The state at every other placement."""
+        return (self.at(number) for number in range(self.count) if number != self.number)
 
     @property
     def tcp(self) -> np.ndarray:

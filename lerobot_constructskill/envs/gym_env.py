@@ -23,7 +23,7 @@ from lerobot_constructskill.contract import (
     get_task,
 )
 from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
-from lerobot_constructskill.envs.recording import keep, recorder
+from lerobot_constructskill.envs.recording import COUNTS, keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.interface import describe_task
 from lerobot_constructskill.perturbations import Perturbation
@@ -54,8 +54,9 @@ class ConstructSkillEnv(gym.Env):
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
     `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
     that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. The reward is
-    the stage reached: 0, 0.5 once lifted, 1 once placed. `info` holds `is_success`, the named booleans of the scene
-    and `clipped_steps`, how many of the episode's actions were clipped; after a reset also `contract`, as JSON.
+    the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of the
+    scene, `clipped_steps`, how many of the episode's actions were clipped, `placements`, how many of the task's are
+    done, and `chain`, how many before the first that is not; after a reset also `contract`, as JSON.
 
     Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
@@ -294,9 +295,9 @@ class ConstructSkillEnv(gym.Env):
 
 
 def public_info(info: dict[str, Any]) -> dict[str, Any]:
-    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans, and the number of clipped steps."""
+    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans and counts."""
     booleans = {name: value for name, value in info.items() if name.startswith("is_")}
-    return {"is_success": info["success"], **booleans, "clipped_steps": info["clipped_steps"]}
+    return {"is_success": info["success"], **booleans, **{name: info[name] for name in COUNTS}}
 
 
 @functools.cache

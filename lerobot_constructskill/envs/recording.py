@@ -39,6 +39,9 @@ STARTING = (*ENVIRONMENT, "obs_type")
 OUTCOME = ("lifted", "placed", "stage", "lift_step", "place_step", "steps")
 """Fields of `Episode` that executing its actions again must reproduce."""
 
+COUNTS = ("clipped_steps", "placements", "chain")
+"""Entries of `info` that count, and fields of `Episode`."""
+
 DECIDING = ("sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
 
@@ -65,6 +68,9 @@ class Episode:
         versions: JSON, as `deciding` gives them.
         clipped_steps: how many of the actions were clipped; None if not counted.
         final_error_m: distance of the object from the goal's centre at the end, in metres; None if not measured.
+        placements: how many of the task's placements were done at the end; None if not counted.
+        chain: how many of them before the first that was not done, in the order of the task.
+        measures: JSON, how the elements of a plan lie at the end, as `plans.measure` says; None without a plan.
         actions: every executed action in order, in pieces whose concatenation is (steps * A) float32, as
             `ConstructSkillEnv.step` takes them.
     """
@@ -85,13 +91,16 @@ class Episode:
     versions: str = "{}"
     clipped_steps: int | None = None
     final_error_m: float | None = None
+    placements: int | None = None
+    chain: int | None = None
+    measures: str | None = None
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
         """Add an executed action, (A,), and what the environment returned as `info` for it."""
         self.actions.append(np.array(action, dtype=np.float32))
         self.steps += 1
-        self.clipped_steps = info["clipped_steps"]
+        self.clipped_steps, self.placements, self.chain = (info[name] for name in COUNTS)
         if info["is_lifted"] and not self.lifted:
             self.lifted, self.lift_step = True, self.steps
         if info["is_success"] and not self.placed:  # a task may ask for more than the paper's placement
@@ -130,7 +139,10 @@ class Episode:
 ACTIONS = {list[np.ndarray]: pa.list_(pa.field("element", pa.float32(), nullable=False))}
 """Python's and Arrow's type of actions; `artifacts.tables` knows those of all other fields."""
 
-RECORDED = Parquet("a recording", Episode, ACTIONS, json={"versions": VERSIONS})
+MEASURED = ("placements", "chain", "measures")
+"""Columns that older files lack."""
+
+RECORDED = Parquet("a recording", Episode, ACTIONS, json={"versions": VERSIONS}, added=MEASURED)
 
 
 def recorder(**facts: Any) -> Episode | None:

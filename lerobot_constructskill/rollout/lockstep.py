@@ -15,6 +15,8 @@ import numpy as np
 from lerobot_constructskill.contract import FPS, OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
 from lerobot_constructskill.lerobot_internals import write_video
+from lerobot_constructskill.plans.measure import measured
+from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
 from lerobot_constructskill.rollout.simulators import Answers, Simulators, Step, simulators
@@ -111,7 +113,8 @@ class _Lanes:
         on_step: OnStep | None,
     ):
         self.agents, self.shared, self.sims, self.seeds, self.on_step = agents, shared, sims, seeds, on_step
-        self.instruction = get_task(env_kwargs.get("task", "brick_to_bin")).instruction
+        task = get_task(env_kwargs.get("task", "brick_to_bin"))
+        self.instruction, self.plan = task.instruction, task.plan and read_plan(task.plan)
         self.running = {i: Rollout() for i in numbers}
         self.over: dict[int, Rollout] = {}
         self.actions: dict[int, np.ndarray] = {}
@@ -143,6 +146,8 @@ class _Lanes:
         episodes, action = self.running[i].episodes, self.actions[i]
         episodes[-1].add(action, step.info)
         episodes[-1].final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
+        if step.done and self.plan:
+            episodes[-1].measures = measured(self.plan, step.sim)
         if self.on_step:
             self.on_step(i, len(episodes) - 1, action, step)
 

@@ -5,7 +5,6 @@ A task derives from `PickPlaceEnv`, loads its asset and, where the layout differ
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from itertools import chain
 
 import numpy as np
 import sapien
@@ -18,6 +17,7 @@ from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
 from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import SimConfig
+from torch.nn.functional import pad
 from transforms3d.euler import euler2quat
 
 from lerobot_constructskill.contract import (
@@ -25,7 +25,9 @@ from lerobot_constructskill.contract import (
     CAMERAS,
     FPS,
     IMAGE_SIZE,
+    MAX_PLACEMENTS,
     OBS_TYPES,
+    PLURALS,
     REWARD_LIFTED,
     REWARD_PLACED,
     ROBOT_BASE,
@@ -221,6 +223,16 @@ class PickPlaceEnv(BaseEnv):
     def _load_scene(self, options: dict) -> None:
         self._load_hall()
         self._load_offcuts()
+        self._load_placements()
+        self._lasting: tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]] | None = None
+        self._is_placed = torch.zeros(self.num_envs, len(self.objects), dtype=torch.bool, device=self.device)
+        self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._unmet: dict[str, torch.Tensor] = {}  # by condition: the last step in which it was not met
+        self._lasted: dict[str, torch.Tensor] = {}
+        self._clipping = Clipping(self.num_envs, self.device)
+
+    def _load_placements(self) -> None:
+        """Build `objects`, in the order in which they are placed, and where they go."""
         builder = self.scene.create_actor_builder()
         self._load_bin(builder)
         builder.initial_pose = sapien.Pose(p=self.bin_position)
@@ -229,9 +241,7 @@ class PickPlaceEnv(BaseEnv):
         self._load_object(builder)
         builder.initial_pose = sapien.Pose(p=[*self.object_center, self.object_size[2] / 2])
         self.object = builder.build_dynamic(name="object")
-        self._lifted = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._placements: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
-        self._clipping = Clipping(self.num_envs, self.device)
+        self.objects = [self.object]
 
     def _load_hall(self) -> None:
         """Ground plane, and the plastered walls of the building around it; the walls do not collide."""
@@ -251,9 +261,8 @@ class PickPlaceEnv(BaseEnv):
 
     def _load_offcuts(self) -> None:
         """Distractors: fixed wooden boxes away from the object, the bin and the way between them."""
-        ends = np.array([self.object_center, self.bin_center, ROBOT_BASE[:2]])
-        way = np.linspace(ends[0], ends[1], 5)
-        for i, (size, place) in enumerate(self.draws.offcuts(np.vstack([ends, way]), self.spawn_range + 0.18)):
+        taken = np.vstack([ROBOT_BASE[:2], *(np.linspace(start, end, 5) for start, end in self.ways)])
+        for i, (size, place) in enumerate(self.draws.offcuts(taken, self.spawn_range + 0.18)):
             builder = self.scene.create_actor_builder()
             self._add_box(builder, [0, 0, 0], size, (0.55, 0.38, 0.20))
             builder.initial_pose = sapien.Pose(p=place)
@@ -315,16 +324,20 @@ class PickPlaceEnv(BaseEnv):
         with torch.device(self.device):
             self.agent.reset(self._initial_qpos(env_idx))
             self.agent.robot.set_pose(sapien.Pose(p=ROBOT_BASE))
-            offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
-            offsets = offsets.to(self.device)
-            position = torch.tensor([*self.object_center, self.object_size[2] / 2]).repeat(len(env_idx), 1)
-            position[:, :2] += offsets[:, :2]
-            half_yaw = offsets[:, 2] / 2
-            zero = torch.zeros_like(half_yaw)
-            quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
-            self.object.set_pose(Pose.create_from_pq(position, quaternion))
-            for memory in (self._lifted, self._clipping.steps, *chain(*self._placements.values())):
+            self._initialize_objects(env_idx)
+            kept = (self._is_placed, self._lifted, self._clipping.steps)
+            for memory in (*kept, *self._unmet.values(), *self._lasted.values()):
                 memory[env_idx] = 0
+
+    def _initialize_objects(self, env_idx: torch.Tensor) -> None:
+        offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
+        offsets = offsets.to(self.device)
+        position = torch.tensor([*self.object_center, self.object_size[2] / 2]).repeat(len(env_idx), 1)
+        position[:, :2] += offsets[:, :2]
+        half_yaw = offsets[:, 2] / 2
+        zero = torch.zeros_like(half_yaw)
+        quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
+        self.object.set_pose(Pose.create_from_pq(position, quaternion))
 
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
         """Joint positions of the rest keyframe, with noise where the pose is perturbed, (9,) or (len(env_idx), 9)."""
@@ -356,6 +369,11 @@ class PickPlaceEnv(BaseEnv):
     # Success
 
     @property
+    def ways(self) -> list[tuple[Sequence[float], Sequence[float]]]:
+        """From where to where each object goes, x and y in metres."""
+        return [(self.object_center, self.bin_center)]
+
+    @property
     def bin_position(self) -> tuple[float, float, float]:
         """Centre of the bin's interior, in metres."""
         return (*self.bin_center, self.bin_floor + self.bin_interior[2] / 2)
@@ -379,28 +397,40 @@ class PickPlaceEnv(BaseEnv):
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
         self._lifted |= center[:, 2] >= LIFT_HEIGHT
         is_placed = self._has_lasted("is_placed", is_in_bin & is_gripper_open)
+        self._is_placed[:] = is_placed[:, None]
         return {
             "is_lifted": self._lifted.clone(),
             "is_in_bin": is_in_bin,
             "is_gripper_open": is_gripper_open,
             "is_placed": is_placed,
+            **self._progress(),
             "success": is_placed.clone(),
+        }
+
+    def _progress(self) -> dict[str, torch.Tensor]:
+        """How many placements are done, how many of them before the first that is not, and what was clipped."""
+        return {
+            "placements": self._is_placed.sum(dim=1),
+            "chain": self._is_placed.long().cumprod(dim=1).sum(dim=1),
             "clipped_steps": self._clipping.steps.clone(),
         }
 
-    def _has_lasted(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
-        """Whether a condition was met in `PLACED_STEPS` consecutive steps of the episode, (num_envs,) booleans.
+    def _lasts(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
+        """Whether a condition was met in `PLACED_STEPS` consecutive steps until now, booleans of its shape.
 
         Args:
             name: of the condition, by which its memory is kept.
-            is_met: whether it is met now, (num_envs,).
+            is_met: whether it is met now, (num_envs,) or (num_envs, placements).
         """
-        new = torch.zeros_like(is_met), torch.zeros_like(self.elapsed_steps)
-        has_lasted, last_unmet = self._placements.get(name, new)
-        last_unmet = torch.where(is_met, last_unmet, self.elapsed_steps)
-        has_lasted = has_lasted | (self.elapsed_steps - last_unmet >= PLACED_STEPS)
-        self._placements[name] = has_lasted, last_unmet
-        return has_lasted.clone()
+        elapsed = self.elapsed_steps.reshape(-1, *[1] * (is_met.ndim - 1)).expand(is_met.shape)
+        last_unmet = torch.where(is_met, self._unmet.get(name, torch.zeros_like(elapsed)), elapsed)
+        self._unmet[name] = last_unmet
+        return elapsed - last_unmet >= PLACED_STEPS
+
+    def _has_lasted(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
+        """Whether a condition has ever lasted in the episode. Arguments and result as of `_lasts`."""
+        self._lasted[name] = self._lasted.get(name, torch.zeros_like(is_met)) | self._lasts(name, is_met)
+        return self._lasted[name].clone()
 
     def compute_sparse_reward(self, obs, action: torch.Tensor, info: dict) -> torch.Tensor:
         """The stage reached, of shape (num_envs,)."""
@@ -412,7 +442,9 @@ class PickPlaceEnv(BaseEnv):
     def _get_obs_extra(self, info: dict) -> dict[str, torch.Tensor]:
         extra = {"tcp_pose": self.agent.tcp.pose.raw_pose}
         if "state" in self.obs_mode:
-            extra |= {"object_pose": self.object.pose.raw_pose, "bin_position": self.bin.pose.p}
+            moving = self.moving_placements()
+            extra |= {"object_pose": moving["object_poses"].flatten(1)}
+            extra |= {"bin_position": moving["bin_positions"].flatten(1)}
         return extra
 
     @outside_autocast
@@ -430,20 +462,47 @@ class PickPlaceEnv(BaseEnv):
     @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:
         """The state that experts read, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
-        joints = self.agent.robot.get_qpos()
-        constants = {
-            "object_size": self.object_size,
-            "object_mass": [float(self.object.mass[0])],
-            "bin_interior": self.bin_interior,
-        }
+        joints, moving = self.agent.robot.get_qpos(), self.moving_placements()
+        count, one = len(self.objects), torch.arange(self.num_envs, device=self.device)
+        following = self._is_placed.long().cumprod(dim=1).sum(dim=1).clamp(max=count - 1)
+        if self._lasting is None:
+            lasting = self.lasting_placements()
+            self._lasting = lasting, {name: _listed(value) for name, value in lasting.items()}
+        lasting, listed = self._lasting
         return {
             "tcp_pose": self.agent.tcp.pose.raw_pose,
             "fingers": joints[:, -2:],
-            "object_pose": self.object.pose.raw_pose,
-            "bin_position": self.bin.pose.p,
+            **{singular: (moving | lasting)[plural][one, following] for singular, plural in PLURALS.items()},
             "joint_positions": joints,
             "joint_velocities": self.agent.robot.get_qvel(),
-        } | {
-            name: torch.tensor(value, device=self.device).expand(self.num_envs, -1)
-            for name, value in constants.items()
+            "placement": following[:, None].float(),
+            "is_placed": _listed(self._is_placed[..., None].float()),
+            **listed,
+            **{name: _listed(value) for name, value in moving.items()},
         }
+
+    def moving_placements(self) -> dict[str, torch.Tensor]:
+        """What `contract.SIM_STATE` lists of the placements and what changes, each (num_envs, placements, n)."""
+        return {"object_poses": self._object_poses(), "bin_positions": self.bin.pose.p[:, None]}
+
+    def _object_poses(self) -> torch.Tensor:
+        """Poses of all objects, (num_envs, placements, 7)."""
+        return torch.stack([one.pose.raw_pose for one in self.objects], dim=1)
+
+    def lasting_placements(self) -> dict[str, torch.Tensor]:
+        """What it lists of them and what stays as long as the scene does, each (num_envs, placements, n)."""
+        return {
+            "object_sizes": self._of_each(self.object_size),
+            "object_masses": torch.stack([one.mass for one in self.objects], dim=1)[..., None].to(self.device),
+            "bin_interiors": self._of_each(self.bin_interior),
+            "is_object": self._of_each([1.0]),
+        }
+
+    def _of_each(self, values: Sequence[float]) -> torch.Tensor:
+        """The same numbers of every placement in every environment, (num_envs, placements, n)."""
+        return torch.tensor(values, device=self.device).expand(self.num_envs, len(self.objects), -1)
+
+
+def _listed(value: torch.Tensor) -> torch.Tensor:
+    """Values of some placements, (num_envs, placements, n), as the privileged state lists them: of the most, flat."""
+    return pad(value, (0, 0, 0, MAX_PLACEMENTS - value.shape[1])).flatten(1)

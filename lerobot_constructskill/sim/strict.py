@@ -15,6 +15,9 @@ REST_SPEED = 0.01
 DEPTH_TOLERANCE = 0.004
 """Largest height in metres above the floor of the receptacle at which an object stands on it."""
 
+PENETRATION = 1e-4
+"""Metres that the solver lets bodies into each other."""
+
 
 class StrictPlaceEnv(PickPlaceEnv):
     """
@@ -43,18 +46,37 @@ class StrictPlaceEnv(PickPlaceEnv):
         return tuple((inside - size) / 2 for inside, size in zip(self.bin_interior, self.object_size, strict=True))[:2]
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        w, x, y, z = self.object.pose.q.unbind(-1)
-        tilt = torch.arccos((1 - 2 * (x * x + y * y)).clamp(-1, 1))
-        yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        offset = (self.object.pose.p - torch.tensor(self.rest_position, device=self.device)).abs()
-        slack = torch.tensor([*self.play, DEPTH_TOLERANCE], device=self.device) + 1e-4  # solver penetration
-        fits = {
-            "is_inside": (offset <= slack).all(dim=-1),
-            "is_upright": tilt <= UPRIGHT,
-            "is_aligned": torch.sin(yaw).abs() <= np.sin(self.yaw_tolerance),
-            "is_at_rest": self.object.linear_velocity.norm(dim=-1) < REST_SPEED,
-        }
-        info = super().evaluate() | fits
-        is_fit = torch.stack([info["is_gripper_open"], *fits.values()]).all(dim=0)
+        rest, slack = (
+            torch.tensor(value, device=self.device) for value in (self.rest_position, (*self.play, DEPTH_TOLERANCE))
+        )
+        speeds = self.object.linear_velocity.norm(dim=-1, keepdim=True)
+        each = fits(self._object_poses(), rest, slack, self.yaw_tolerance, speeds)
+        info = super().evaluate() | {name: value[:, 0] for name, value in each.items()}
+        is_fit = torch.stack([info["is_gripper_open"], *(info[name] for name in each)]).all(dim=0)
         is_placed_strictly = self._has_lasted("is_placed_strictly", is_fit)
+        self._is_placed[:] = is_placed_strictly[:, None]
+        info |= self._progress()
         return info | {"is_placed_strictly": is_placed_strictly, "success": is_placed_strictly.clone()}
+
+
+def fits(
+    poses: torch.Tensor, rest: torch.Tensor, slack: torch.Tensor, yaw_tolerance: float, speeds: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """In which respects objects are where they were meant to be, each (num_envs, placements) booleans.
+
+    Args:
+        poses: of the objects, (num_envs, placements, 7).
+        rest: where their middles come to rest, (num_envs, placements, 3) or (3,) metres.
+        slack: how far they may be off it in x, y and z, (3,) metres.
+        yaw_tolerance: largest turn in radians.
+        speeds: of the objects, (num_envs, placements) m/s.
+    """
+    w, x, y, z = poses[..., 3:].unbind(-1)
+    tilt = torch.arccos((1 - 2 * (x * x + y * y)).clamp(-1, 1))
+    yaw = torch.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return {
+        "is_inside": ((poses[..., :3] - rest).abs() <= slack + PENETRATION).all(dim=-1),
+        "is_upright": tilt <= UPRIGHT,
+        "is_aligned": torch.sin(yaw).abs() <= np.sin(yaw_tolerance),
+        "is_at_rest": speeds < REST_SPEED,
+    }

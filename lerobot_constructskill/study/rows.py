@@ -16,7 +16,7 @@ from annotated_types import Ge, Lt
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
-from lerobot_constructskill.envs.recording import Episode
+from lerobot_constructskill.envs.recording import MEASURED, Episode
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.files import Json, Yaml
 
@@ -143,6 +143,7 @@ class EpisodeRow:
         steps: length of the episode.
         clipped_steps: how many of its actions asked for more than the controller gives; null in rows from before these
             were counted.
+        placements, chain, measures: null in rows from before tasks were lists of placements.
         error_kind: null where the run finished; `NOT_RUN`, or what kind of failure: "weights" (of a backbone, to be
             had nowhere), "input", "missing", "taken", "machine" or "fault". Such a run has one row, episode 0.
         error: why the run failed, one sentence.
@@ -166,6 +167,9 @@ class EpisodeRow:
     final_error_m: float | None = None
     steps: int | None = None
     clipped_steps: int | None = None
+    placements: int | None = None
+    chain: int | None = None
+    measures: str | None = None
     error_kind: str | None = None
     error: str | None = None
     dataset_sha256: str | None = None
@@ -176,7 +180,7 @@ class EpisodeRow:
 
     def filled(self, episode: Episode, number: int) -> "EpisodeRow":
         """This row with the outcome of an episode, which has this number within the run."""
-        measured = {"final_error_m": episode.final_error_m, "clipped_steps": episode.clipped_steps}
+        measured = {name: getattr(episode, name) for name in ("final_error_m", "clipped_steps", *MEASURED)}
         return replace(self, evaluation_seed=episode.evaluation_seed, episode=number, **episode.outcome, **measured)
 
 
@@ -206,8 +210,13 @@ class Row(EpisodeRow):
 
 
 TABLES = {
-    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, json={"versions": VERSIONS}),
-    Row: Parquet("a table of a study's rows", Row, json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS}),
+    EpisodeRow: Parquet("a table of a run's rows", EpisodeRow, json={"versions": VERSIONS}, added=MEASURED),
+    Row: Parquet(
+        "a table of a study's rows",
+        Row,
+        json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS},
+        added=MEASURED,
+    ),
 }
 
 NULLABLE = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype(), pa.string(): pd.StringDtype()}

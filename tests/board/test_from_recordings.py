@@ -11,13 +11,14 @@ import yaml
 from lerobot_constructskill.board.declaration import DRAWS, About
 from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit, with_draws
 from lerobot_constructskill.board.protocol import BoardSetting
-from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
+from lerobot_constructskill.envs.recording import COUNTS, RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.submit import SubmitConfig
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
 
 CONTROL = BoardSetting("block_to_bin", episodes=2, episode_length=2, first_start=7)
 SETTINGS = {"control": CONTROL, "block": replace(CONTROL, perturb="pose=1")}
+NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys(COUNTS, 0)
 ABOUT = About(*["a test's"] * 7, observes="pixels")
 
 
@@ -25,7 +26,7 @@ def recording(start, value=0.01, **facts):
     made = {"task": "block_to_bin", "episode_length": 2, "perturb": " pose=1", "backend": "physx_cpu, none rendering"}
     one = Episode(start, **made | facts)
     for _ in range(2):
-        one.add(np.full(4, value), {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
+        one.add(np.full(4, value), NOTHING_YET)
     return one
 
 

@@ -6,7 +6,7 @@ The experts, the noise, the recorder and the video encoder are the real ones.
 import numpy as np
 import pytest
 
-from lerobot_constructskill.contract import IMAGE_SIZE, OBS_TYPES, REWARD_LIFTED, REWARD_PLACED
+from lerobot_constructskill.contract import IMAGE_SIZE, OBS_TYPES, PLURALS, REWARD_LIFTED, REWARD_PLACED, SIM_STATE
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 
@@ -61,6 +61,11 @@ class ToyEnv:
             "joint_positions": [0.1 * self.tcp[0], 0.4, 0, -2, 0, 2.4, 0.8, 0.04, 0.04],
             "joint_velocities": np.zeros(9),
         }
+        one = {"placement": [0], "is_object": [1], "is_placed": [float(self.settled >= 5)]}
+        for singular in ("object_pose", "object_size", "object_mass", "bin_position", "bin_interior"):
+            one[PLURALS[singular]] = state[singular]
+        for name, value in one.items():
+            state[name] = np.pad(value, (0, len(SIM_STATE[name]) - len(value)))
         return {name: np.array(value, dtype=np.float32) for name, value in state.items()}
 
     def agent_state(self):

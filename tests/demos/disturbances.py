@@ -148,8 +148,8 @@ def recover(env, expert, disturbance, seed):
     the expert says that it is hopeless."""
     env.reset(seed=seed)
     disturbance(env, expert, np.random.default_rng(seed))
-    success, steps, advice = False, 0, None
-    while not success and steps < 350:
+    success, steps, advice, most = False, 0, None, 350 * state_of(env).count
+    while not success and steps < most:
         advice = expert.advise(state_of(env))
         if advice.hopeless and steps > 100:
             break

@@ -42,7 +42,7 @@ SCENES = {
 UNSOLVABLE = {"tipped", "dropped_on_the_way"}
 """Disturbances after which an object that lies on its side, or against the bin, may have no side that jaws take."""
 
-TIGHT = {name for name, task in TASKS.items() if task.expert.endswith(":PreciseExpert")}
+TIGHT = {name for name, task in TASKS.items() if task.expert.endswith((":PreciseExpert", ":LayingExpert"))}
 """Tasks in which an object that was turned, or swings because it is held off its middle, may not fit any more, and
 whose action has no rotation to set it straight."""
 

@@ -8,18 +8,24 @@ from commands import call
 
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.envs.recording import FOLDER, Episode, read_recordings, recording_into, write_recordings
+from lerobot_constructskill.envs.recording import (
+    COUNTS,
+    FOLDER,
+    Episode,
+    read_recordings,
+    recording_into,
+    write_recordings,
+)
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError
 
+NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys(COUNTS, 0)
 DOWN_OPEN = np.array([0.01, 0.02, -0.03, 1], dtype=np.float64)
 
 
 def test_recordings_are_read_as_they_were_written(tmp_path):
     made = [Episode(7, lifted=True, stage="lifted", lift_step=2, task="brick_to_bin"), Episode(8)]
-    made[0].add(
-        np.float32([0.1, 0, -0.1, 1]), {"is_lifted": True, "is_in_bin": False, "is_success": False, "clipped_steps": 0}
-    )
+    made[0].add(np.float32([0.1, 0, -0.1, 1]), NOTHING_YET | {"is_lifted": True})
     write_recordings(made, tmp_path / "some.parquet")
     read = read_recordings(tmp_path / "some.parquet")
     for one, other in zip(made, read, strict=True):
@@ -34,12 +40,12 @@ def test_an_array_that_its_caller_uses_again_is_recorded_as_it_was():
     recording, action = Episode(7), np.zeros(4, np.float32)
     for number in range(3):
         action[:] = number
-        recording.add(action, {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0})
+        recording.add(action, NOTHING_YET)
     np.testing.assert_array_equal(recording.flat, np.repeat(np.float32([0, 1, 2]), 4))
 
 
 def test_an_episode_keeps_the_furthest_stage_and_the_first_step_of_each_milestone():
-    episode, nothing = Episode(1000), {"is_lifted": False, "is_in_bin": False, "is_success": False, "clipped_steps": 0}
+    episode, nothing = Episode(1000), NOTHING_YET
     for info in ({}, {"is_lifted": True}, {"is_lifted": True, "is_in_bin": True}, {"is_lifted": True}):
         episode.add(np.zeros(4), nothing | info)
     assert (episode.stage, episode.lift_step, episode.place_step, episode.steps) == ("in_bin", 2, None, 4)

@@ -12,6 +12,7 @@ from lerobot.envs.utils import check_env_attributes_and_types, preprocess_observ
 
 from lerobot_constructskill.contract import REWARD_LIFTED
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.envs.recording import COUNTS
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError
 
@@ -80,7 +81,7 @@ class Scene:
         return {
             "success": torch.tensor(self.n >= self.ends),
             "is_lifted": torch.tensor([True] * 3),
-            "clipped_steps": torch.zeros(3),
+            **dict.fromkeys(COUNTS, torch.zeros(3)),
         }
 
 

@@ -1,5 +1,7 @@
 """The tasks with the paper's brick: into its bin, shifted, turned, into ever tighter bins, and on another brick."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import sapien
 from mani_skill.utils.building import ActorBuilder
@@ -49,15 +51,25 @@ class BrickToBinEnv(PickPlaceEnv):
         self._add_brick(builder, 0.0)
 
     def _add_brick(self, builder: ActorBuilder, height: float) -> None:
-        x, y, z = np.array(self.object_size) / 2
-        colour, pattern = self.draws.surface("brick", CLAY_RED, 0)
-        clay = mottled(colour, contrast=0.12, size=512, seed=pattern)
-        self._add_box(builder, [0, 0, height], self.object_size, clay, CLAY_DENSITY)
-        if self.scene.can_render():
-            # SAPIEN unfolds a box on its texture as a cross of 3 x 4 faces: 2 x 5 holes a face.
-            bed = perforated(clay, rows=3 * 2, columns=4 * 5, radius=0.28)
-            for side in (-1, 1):  # a skin on each bed face shows the perforations
-                builder.add_box_visual(sapien.Pose([0, side * y, height]), [x, SKIN, z], material=textured(bed))
+        add_brick(self, builder, height, self.object_size)
+
+
+def add_brick(env: PickPlaceEnv, builder: ActorBuilder, height: float, size: Sequence[float]) -> None:
+    """Add a brick to an actor.
+
+    Args:
+        height: of its middle over the actor's origin, in metres.
+        size: edges in metres, (3,).
+    """
+    x, y, z = np.array(size) / 2
+    colour, pattern = env.draws.surface("brick", CLAY_RED, 0)
+    clay = mottled(colour, contrast=0.12, size=512, seed=pattern)
+    env._add_box(builder, [0, 0, height], size, clay, CLAY_DENSITY)
+    if env.scene.can_render():
+        # SAPIEN unfolds a box on its texture as a cross of 3 x 4 faces: 2 x 5 holes a face.
+        bed = perforated(clay, rows=3 * 2, columns=4 * 5, radius=0.28)
+        for side in (-1, 1):  # a skin on each bed face shows the perforations
+            builder.add_box_visual(sapien.Pose([0, side * y, height]), [x, SKIN, z], material=textured(bed))
 
 
 @register_env(TASKS["brick_to_bin_shifted"].env_id, max_episode_steps=TASKS["brick_to_bin_shifted"].horizon)

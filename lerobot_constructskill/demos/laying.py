@@ -1,0 +1,59 @@
+"""The expert of walls: it lays one element after the other, and carries each over everything that stands there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_constructskill.contract import ROBOT_BASE
+from lerobot_constructskill.demos.expert import ExpertProgress, Phase
+from lerobot_constructskill.demos.precise import PreciseExpert
+from lerobot_constructskill.demos.state import PrivilegedState
+
+RISEN_CLEAR = 0.10
+"""Height in metres of the TCP over a laid element at which the hand turns to the next one."""
+
+FULL_LEVER = 0.65
+"""Distance in metres from the robot's base at which `ExpertConfig.compliance` was measured."""
+
+TOUCHING = 0.002
+"""Height in metres over the floor from which down an element's lowest corner carries a part of its weight."""
+
+
+@dataclass(frozen=True)
+class LayingExpert(PreciseExpert):
+    """Begins anew with the next placement, and keeps out of the way of all that stands."""
+
+    release_gap = 0.002
+
+    def _underside(self, state: PrivilegedState) -> float:
+        """Height of the middle of the underside in metres.
+
+        An element hangs a few degrees off level in the jaws. Pressed on what carries it, it turns between them; let go
+        from its lowest corner, it would fall to one side.
+        """
+        return state.object_pose[2] - state.object_size[2] / 2
+
+    def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
+        risen = state.tcp[2] - (state.object_pose[2] + state.object_size[2] / 2)
+        return after.phase is Phase.RELEASE and risen > RISEN_CLEAR
+
+    def _carry_error(self, state: PrivilegedState) -> np.ndarray:
+        """From the object's centre to the point where its underside is `release_clearance` above all others, (3,)."""
+        highest = max([float(state.rim), *(other.top for other in state.others())])
+        above = highest + self.config.release_clearance + state.object_size[2] / 2
+        return np.array([*state.bin_position[:2], above]) - state.object_pose[:3]
+
+    def _hold_up(self, step: np.ndarray, state: PrivilegedState) -> np.ndarray:
+        # What stands on its lowest corner is carried by what is below: only then can it be pressed down.
+        carried = float(np.clip((super()._underside(state) - state.floor) / TOUCHING, 0, 1))
+        return step + carried * (super()._hold_up(step, state) - step)
+
+    def _weight_compensation(self, state: PrivilegedState) -> np.ndarray:
+        """As much of it as the arm sags there: with the square of the lever, and hardly at all near the base."""
+        lever = np.hypot(*(state.tcp - ROBOT_BASE)[:2]) / FULL_LEVER
+        return super()._weight_compensation(state) * min(lever, 1.0) ** 2
+
+    # Advice
+
+    def _obstacle(self, state: PrivilegedState, grasp: np.ndarray) -> float:
+        return max([state.obstacle, *(other.top for other in state.others())])

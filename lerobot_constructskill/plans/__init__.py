@@ -1,0 +1,1 @@
+"""Walls as lists of placements: read, checked, drawn, and made from IFC files."""

@@ -1,0 +1,157 @@
+"""Walls: several elements laid after a plan, each on and beside what really lies there."""
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.building import ActorBuilder
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Actor, Pose
+
+from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.plans.plan import Kind, Plan, read_plan, supplies
+from lerobot_constructskill.sim.actions import Hold
+from lerobot_constructskill.sim.scene import FINGER_OPEN, LIFT_HEIGHT, PickPlaceEnv
+from lerobot_constructskill.sim.strict import DEPTH_TOLERANCE, fits
+from lerobot_constructskill.sim.tasks.brick import add_brick
+from lerobot_constructskill.sim.visuals import mottled
+
+OPENING = 0.015
+"""Height in metres of what stands for a receptacle over the place of an element: it has no walls."""
+
+SPRUCE = (205, 164, 110)
+
+
+class WallEnv(PickPlaceEnv):
+    """
+    **Task Description:**
+    Lay the elements of a plan in its order. Each goes on and beside what really lies there, so that what is laid first
+    moves what comes after.
+
+    **Randomizations:**
+    - Every element waits within 0.03 m of its nominal place in x and y; its yaw is fixed.
+    - Every element has a size of its own, within its standard's tolerance.
+
+    **Success Conditions:**
+    - Every element is within the plan's tolerance of its place in x and y, stands on what carries it, is upright,
+      aligned and at rest, and was let go for five consecutive steps. One that is moved later has to be laid again.
+
+    Args:
+        plan: a name in `configs/plan` or a file.
+    """
+
+    spawn_range = 0.03
+    yaw_range = 0.0
+    yaw_tolerance = np.radians(3.0)
+    hold = Hold(yaw=True)
+
+    def __init__(self, *args, plan: str = "course_of_three", **kwargs):
+        self.plan: Plan = read_plan(plan)
+        super().__init__(*args, reconfiguration_freq=1, **kwargs)  # each episode has sizes of its own
+
+    @property
+    def object_center(self) -> tuple[float, float]:
+        return next(supplies(self.plan))
+
+    @property
+    def ways(self) -> list[tuple[Sequence[float], Sequence[float]]]:
+        return [(start, place[:2]) for start, place in zip(supplies(self.plan), self.plan.drawn, strict=True)]
+
+    # Scene
+
+    def _load_placements(self) -> None:
+        self.sizes = self._draw_sizes()
+        self.objects = [self._build(number, kind) for number, kind in enumerate(self.plan.kinds)]
+        self.object = self.objects[0]
+        self._sizes = torch.tensor(self.sizes, dtype=torch.float32, device=self.device)
+        self._edges = [tuple(self._sizes[:, number].unbind(-1)) for number in range(len(self.objects))]
+        self._targets = torch.zeros(self.num_envs, len(self.objects), 3, device=self.device)
+
+    def _draw_sizes(self) -> np.ndarray:
+        """Sizes of all elements in metres, (num_envs, elements, 3), from the episodes' seeds."""
+        nominal = np.array([kind.size for kind in self.plan.kinds])
+        most = np.array([kind.deviations for kind in self.plan.kinds])
+        mark = zlib.crc32(b"sizes")
+        drawn = [np.random.default_rng([int(seed), mark]).uniform(-1, 1, most.shape) for seed in self._episode_seed]
+        return nominal + most * np.array(drawn)
+
+    def _build(self, number: int, kind: Kind) -> Actor:
+        built = []
+        for environment, sizes in enumerate(self.sizes):
+            builder = self.scene.create_actor_builder()
+            self._add_element(builder, kind, sizes[number])
+            builder.initial_pose = sapien.Pose(p=[0, 0, 2 + number])
+            builder.set_scene_idxs([environment])
+            built.append(builder.build_dynamic(name=f"element_{number}_{environment}"))
+        return built[0] if len(built) == 1 else Actor.merge(built, name=f"element_{number}")
+
+    def _add_element(self, builder: ActorBuilder, kind: Kind, size: np.ndarray) -> None:
+        if kind.factor:
+            add_brick(self, builder, 0.0, size)
+        else:
+            self._add_box(builder, [0, 0, 0], size, mottled(SPRUCE, contrast=0.06, seed=2), kind.density)
+
+    # Initial state
+
+    def _initialize_objects(self, env_idx: torch.Tensor) -> None:
+        rng = self._batched_episode_rng[env_idx]
+        offsets = np.reshape(rng.uniform(-1, 1, size=(len(self.objects), 2)), (-1, len(self.objects), 2))
+        for number, place in enumerate(supplies(self.plan)):
+            position = torch.zeros(len(env_idx), 3)
+            position[:, :2] = torch.from_numpy(np.array(place) + self.spawn_range * offsets[:, number])
+            position[:, 2] = self._sizes[env_idx, number, 2] / 2
+            upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(env_idx), 1)
+            self.objects[number].set_pose(Pose.create_from_pq(position, upright))
+
+    # Success
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        poses = self._object_poses()
+        speeds = torch.stack([one.linear_velocity.norm(dim=-1) for one in self.objects], dim=1)
+        slack = torch.tensor([self.plan.tolerance, self.plan.tolerance, DEPTH_TOLERANCE], device=self.device)
+        each = fits(poses, self._rest_positions(poses), slack, self.yaw_tolerance, speeds)
+        is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
+        lies = torch.stack([*each.values()]).all(dim=0)
+        was_let_go = self._lasts("lies", lies & is_gripper_open[:, None])
+        self._is_placed = lies & (self._is_placed | was_let_go)
+        self._targets = self._rest_positions(poses)
+        self._lifted |= (poses[..., 2] >= LIFT_HEIGHT).any(dim=1)
+        is_placed = self._is_placed.all(dim=1)
+        return {
+            "is_lifted": self._lifted.clone(),
+            "is_in_bin": each["is_inside"].all(dim=1),
+            "is_gripper_open": is_gripper_open,
+            "is_placed": is_placed,
+            **{name: value.all(dim=1) for name, value in each.items()},
+            **self._progress(),
+            "success": is_placed.clone(),
+        }
+
+    def _rest_positions(self, poses: torch.Tensor) -> torch.Tensor:
+        """Where the middle of each element comes to rest as the placed ones lie, (num_envs, elements, 3) metres."""
+
+        def seen(number, place):
+            lies, own = self._is_placed[:, number], poses[:, number].unbind(-1)
+            return tuple(torch.where(lies, really, planned) for really, planned in zip(own, place, strict=False))
+
+        places = [number for place in self.plan.resting(self._edges, seen) for number in place]
+        columns = [torch.as_tensor(one, device=self.device).float().expand(self.num_envs) for one in places]
+        return torch.stack(columns, dim=-1).reshape(self.num_envs, -1, 3)
+
+    # Privileged state
+
+    def moving_placements(self) -> dict[str, torch.Tensor]:
+        middle = self._targets + (OPENING - self._sizes) / 2 * torch.tensor([0.0, 0.0, 1.0], device=self.device)
+        return {"object_poses": self._object_poses(), "bin_positions": middle}
+
+    def lasting_placements(self) -> dict[str, torch.Tensor]:
+        interior = self._sizes + 2 * self.plan.tolerance
+        interior[..., 2] = OPENING
+        return super().lasting_placements() | {"object_sizes": self._sizes, "bin_interiors": interior}
+
+
+for _task in TASKS.values():
+    if _task.plan is not None:
+        register_env(_task.env_id, max_episode_steps=_task.horizon, plan=_task.plan)(WallEnv)
