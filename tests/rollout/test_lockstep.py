@@ -12,6 +12,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from lerobot_constructskill.contract import GRIPPER_CLOSED
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.envs.recording import COUNTS
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import native_precision
 from lerobot_constructskill.rollout import lockstep
