@@ -6,9 +6,9 @@ as privileged state.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from math import pi
+from math import pi, sqrt
 from typing import Any
 
 from lerobot_constructskill.errors import InputError
@@ -25,6 +25,19 @@ ACTION_SCALE = 0.1
 
 ROBOT_BASE = (-0.615, 0.0, 0.0)
 """Where the Panda stands in the world, in metres: ManiSkill's own default."""
+
+SHOULDER_HEIGHT, WRIST_RADIUS, WRIST_HEIGHT = 0.333, 0.088, 0.2104
+"""Of the Panda with its hand pointing down, in metres: the shoulder above the base, and the wrist above the TCP and
+nearer to the base (Franka's kinematic parameters)."""
+
+REACH = 0.66
+"""Longest distance from shoulder to wrist in metres; 0.06 short of the stretched arm, near which IK fails."""
+
+
+def highest_tcp(radius: float) -> float:
+    """Height in metres that the TCP reaches with the hand pointing down, so far in metres from the base's axis."""
+    return SHOULDER_HEIGHT - WRIST_HEIGHT + sqrt(max(0.0, REACH**2 - (radius - WRIST_RADIUS) ** 2))
+
 
 GRIPPER_OPEN, GRIPPER_CLOSED = 1.0, -1.0
 
@@ -175,6 +188,9 @@ SUITES = {
 }
 """Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
 
+PLANNED = "plan:"
+"""Before the name or file of a plan, where a task is asked for: the wall of that plan."""
+
 FIELDS = {
     "name": f"it is lower-case letters, digits and underscores, and none of the suites {', '.join(SUITES)}",
     "horizon": "it is a whole number of steps from 1 on",
@@ -216,7 +232,7 @@ class Task:
 
     def __post_init__(self):
         wrong = {
-            "name": not re.fullmatch(r"[a-z0-9_]+", str(self.name)) or self.name in SUITES,
+            "name": not re.fullmatch(rf"[a-z0-9_]+|{PLANNED}.+", str(self.name)) or self.name in SUITES,
             "horizon": not isinstance(self.horizon, int) or self.horizon < 1,
             "scene": not re.fullmatch(r"[\w.]+:\w+", str(self.scene)),
             "expert": not re.fullmatch(r"[\w.]+:\w+", str(self.expert)),
@@ -347,6 +363,14 @@ SHIPPED = {
 }
 """The rows of this package, by name."""
 
+PLAN_TASK = replace(
+    SHIPPED["course_of_three"],
+    env_id="ConstructionPlan-v1",
+    instruction="Build the wall after its plan.",
+    horizon=400 * MAX_PLACEMENTS,
+)
+"""The row of any other plan, which is named by the task: `plan:NAME_OR_FILE`."""
+
 TASKS: dict[str, Task]
 """All rows, by name: those of this package, then those that other installed packages offer."""
 
@@ -381,8 +405,10 @@ def get_task(name: str) -> Task:
         ValueError: there is no such task; the message lists those there are.
     """
     tasks = _all_tasks()
+    if name.startswith(PLANNED) and name != PLANNED:
+        return replace(PLAN_TASK, name=name, plan=name.removeprefix(PLANNED))
     if name not in tasks:
-        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}.")
+        raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}; and {PLANNED}NAME_OR_FILE.")
     return tasks[name]
 
 
@@ -402,7 +428,7 @@ def select_tasks(names: str) -> dict[str, list[Task]]:
     selected: dict[str, list[Task]] = {}
     for name in (part.strip() for part in names.split(",")):
         suite, members = (name, SUITES[name]) if name in SUITES else (LOOSE, (name,))
-        if suite == LOOSE and name not in _all_tasks():
+        if suite == LOOSE and name not in _all_tasks() and not name.startswith(PLANNED):
             tasks, suites = ", ".join(_all_tasks()), ", ".join(SUITES)
             raise InputError(f"Unknown task '{name}'; the tasks are: {tasks}; the suites: {suites}.")
         selected.setdefault(suite, []).extend(get_task(member) for member in members)

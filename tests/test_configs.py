@@ -64,7 +64,8 @@ def test_a_suites_set_is_the_everyday_set_of_its_task(path):
 def test_a_precise_set_is_the_everyday_one_with_noise_to_its_end(path):
     everyday = generate_config(CONFIGS / "generate" / "fast_wrist.yaml")
     noise = replace(everyday.noise, release_sigma=0.003)
-    precise = replace(everyday, task=path.stem, noise=noise, video="lossless", max_steps=500)
+    steps = 500 if get_task(path.stem).plan is None else get_task(path.stem).horizon
+    precise = replace(everyday, task=path.stem, noise=noise, video="lossless", max_steps=steps)
     failures = {"brick_to_bin_3mm": 3.0}.get(path.stem, everyday.max_failures)
     assert generate_config(path) == replace(precise, max_failures=failures)
 

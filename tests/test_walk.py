@@ -3,8 +3,8 @@
 import pytest
 from walk import walk
 
-WAYS = {"study.session:run_study": (16, 6), "dagger.run:run_dagger": (15, 5)}
-"""Rooms and climbs, at most."""
+WAYS = {"study.session:run_study": (17, 6), "dagger.run:run_dagger": (16, 6)}
+"""Rooms and climbs, at most; `plans` is one that every task of several objects needs."""
 
 
 @pytest.mark.parametrize("start", WAYS)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE
+from lerobot_constructskill.contract import GRIPPER_CLOSED, GRIPPER_OPEN, ROBOT_BASE, highest_tcp
 from lerobot_constructskill.demos.expert import Advice, ExpertConfig, ExpertProgress, Phase
 from lerobot_constructskill.demos.state import GROUNDED, PrivilegedState
 
@@ -15,13 +15,6 @@ ABOVE_TOP = 0.02
 
 AROUND = 0.005
 """Height of the TCP over the object's top from which down the finger tips, 9 mm below it, are around the object."""
-
-SHOULDER_HEIGHT, WRIST_RADIUS, WRIST_HEIGHT = 0.333, 0.088, 0.2104
-"""Of the Panda with its hand pointing down, in metres: the shoulder above the base, and the wrist above the TCP and
-nearer to the base (Franka's kinematic parameters)."""
-
-REACH = 0.66
-"""Longest distance from shoulder to wrist in metres; 0.06 short of the stretched arm, near which IK fails."""
 
 OVERHEAD = 0.03
 """Horizontal distance to the grasp within which the hand goes down, in metres."""
@@ -252,6 +245,4 @@ class PickPlaceExpert:
 
 def _within_reach(point: np.ndarray) -> np.ndarray:
     """`point`, (3,) metres, or the highest one below it that the arm reaches."""
-    radius = np.hypot(*(point[:2] - ROBOT_BASE[:2])) - WRIST_RADIUS
-    highest = SHOULDER_HEIGHT - WRIST_HEIGHT + np.sqrt(max(0.0, REACH**2 - radius**2))
-    return np.array([*point[:2], min(point[2], highest)])
+    return np.array([*point[:2], min(point[2], highest_tcp(np.hypot(*(point[:2] - ROBOT_BASE[:2]))))])

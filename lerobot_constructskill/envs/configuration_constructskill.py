@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, STATE_NAMES, select_tasks
+from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, PLANNED, STATE_NAMES, select_tasks
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
 from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType, perturbed_task
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
@@ -29,6 +29,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     Args:
         task: a name in `contract.TASKS` or in `contract.SUITES`, or several separated by commas, whose actions
             must be the same.
+        plan: a plan in `configs/plan` or a file: the wall that is built instead of a task.
         obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the 8-number
             state, for policies that need them).
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
@@ -43,6 +44,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     """
 
     task: str = "brick_to_bin"
+    plan: str | None = None
     fps: Annotated[int, Range(FPS, FPS, unit="Hz, the control rate of every task")] = FPS
     obs_type: ObsType = "pixels"
     episode_length: Steps | None = None
@@ -55,6 +57,8 @@ class ConstructSkillEnvConfig(EnvConfig):
     def __post_init__(self):
         with as_field_error():
             check(self)
+            if self.plan is not None:
+                self.task = f"{PLANNED}{self.plan}"
             if self.max_parallel_tasks != 1:
                 raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
             if self.vectorization == "native":

@@ -27,6 +27,8 @@ from lerobot_constructskill.envs.recording import COUNTS, keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.interface import describe_task
 from lerobot_constructskill.perturbations import Perturbation
+from lerobot_constructskill.plans.check import check_plan
+from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.threads import one_thread
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
@@ -37,9 +39,12 @@ def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Pe
     """The task and its perturbation.
 
     Raises:
-        InputError: no such task, axis or level, or a brick of another size where none is or where it does not fit.
+        InputError: no such task, axis or level, a plan that cannot be built, or a brick of another size where none is
+            or where it does not fit.
     """
     task, perturbation = get_task(name), Perturbation(perturb, perturb_seed)
+    if task.plan is not None:
+        check_plan(read_plan(task.plan))
     perturbation.check(task)
     if perturbation.amount("size") and name in LADDER:
         from lerobot_constructskill.sim.perturb import Draws, check_fits
@@ -62,7 +67,7 @@ class ConstructSkillEnv(gym.Env):
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
 
     Args:
-        task: a name in `contract.TASKS`.
+        task: a name in `contract.TASKS`, or `plan:NAME_OR_FILE`.
         obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
@@ -223,7 +228,7 @@ class ConstructSkillEnv(gym.Env):
             render_mode="rgb_array" if self.cameras else None,
             max_episode_steps=None,
             disable_env_checker=True,
-            **self._scene_kwargs,
+            **self._scene_kwargs | ({} if self._row.plan is None else {"plan": self._row.plan}),
         ).unwrapped
 
     def _ensure_env(self) -> gym.Env:

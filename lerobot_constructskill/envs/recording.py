@@ -7,6 +7,7 @@ runs it: `lerobot-eval`, an evaluation harness, a loop of one's own. A study kee
 import hashlib
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,7 +133,8 @@ class Episode:
         """Write a file of its own, named by what is in it: an equal episode is the same file."""
         hashed = hashlib.sha256(self.flat.tobytes()).hexdigest()[:12]
         label = Perturbation(self.perturb, self.perturb_seed).label
-        name = f"{self.task}{label}-{self.episode_length}-{self.evaluation_seed}-{hashed}.parquet"
+        task = re.sub(r"[^\w.-]", "_", self.task)  # a plan may be a file
+        name = f"{task}{label}-{self.episode_length}-{self.evaluation_seed}-{hashed}.parquet"
         write_recordings([self], folder / name)
 
 

@@ -10,7 +10,8 @@ from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Actor, Pose
 
-from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.contract import PLAN_TASK, SHIPPED
+from lerobot_constructskill.plans.check import check_plan
 from lerobot_constructskill.plans.plan import Kind, Plan, read_plan, supplies
 from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.scene import FINGER_OPEN, LIFT_HEIGHT, PickPlaceEnv
@@ -40,6 +41,10 @@ class WallEnv(PickPlaceEnv):
 
     Args:
         plan: a name in `configs/plan` or a file.
+
+    Raises:
+        MissingError: there is no such plan.
+        InputError: it is no plan, or cannot be built.
     """
 
     spawn_range = 0.03
@@ -49,6 +54,7 @@ class WallEnv(PickPlaceEnv):
 
     def __init__(self, *args, plan: str = "course_of_three", **kwargs):
         self.plan: Plan = read_plan(plan)
+        check_plan(self.plan)
         super().__init__(*args, reconfiguration_freq=1, **kwargs)  # each episode has sizes of its own
 
     @property
@@ -115,7 +121,9 @@ class WallEnv(PickPlaceEnv):
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
         lies = torch.stack([*each.values()]).all(dim=0)
         was_let_go = self._lasts("lies", lies & is_gripper_open[:, None])
-        self._is_placed = lies & (self._is_placed | was_let_go)
+        # What is laid on an element presses and shakes it.
+        stays = torch.stack([value for name, value in each.items() if name != "is_at_rest"]).all(dim=0)
+        self._is_placed = stays & (self._is_placed | was_let_go)
         self._targets = self._rest_positions(poses)
         self._lifted |= (poses[..., 2] >= LIFT_HEIGHT).any(dim=1)
         is_placed = self._is_placed.all(dim=1)
@@ -152,6 +160,6 @@ class WallEnv(PickPlaceEnv):
         return super().lasting_placements() | {"object_sizes": self._sizes, "bin_interiors": interior}
 
 
-for _task in TASKS.values():
+for _task in (PLAN_TASK, *SHIPPED.values()):
     if _task.plan is not None:
         register_env(_task.env_id, max_episode_steps=_task.horizon, plan=_task.plan)(WallEnv)

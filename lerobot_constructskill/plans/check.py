@@ -1,0 +1,119 @@
+"""Whether a plan can be built by this robot: reach, room for the fingers, support, and the order of laying."""
+
+from collections.abc import Iterator
+from math import hypot
+
+from lerobot_constructskill.contract import ROBOT_BASE, highest_tcp
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.plans.plan import Kind, Plan, Position, supplies
+
+NEAREST, FARTHEST = 0.30, 0.76
+"""Horizontal distances in metres from the robot's base between which the hand lays with its fingers down."""
+
+CARRIED_OVER, HELD_BELOW = 0.04, 0.03
+"""Height in metres at which an element is carried over all others, and of the TCP below an element's top."""
+
+FINGERS, FINGER_WIDTH, TIPS = 0.062, 0.022, 0.012
+"""In metres: from the TCP along the jaws to the outside of an open finger, a finger's width, and its tip below it."""
+
+CLOSE = 0.0005
+"""Metres that neighbours may be into each other by rounding."""
+
+LEANING = 0.006
+"""Largest planned difference in metres between the heights of what carries one element."""
+
+APART = 0.12
+"""Distance in metres across the wall that an element keeps from those that wait."""
+
+
+def check_plan(plan: Plan) -> None:
+    """Refuse a plan that cannot be built.
+
+    Raises:
+        InputError: the message names the element and what is wrong with it, and says how many other things are.
+    """
+    found = list(complaints(plan))
+    if found:
+        more = f" {len(found) - 1} more: `constructskill-plan` lists them." if len(found) > 1 else ""
+        raise InputError(found[0] + more)
+
+
+def complaints(plan: Plan) -> Iterator[str]:
+    """Sentences about what cannot be built, in the order of laying."""
+    boxes = [(name, place, kind) for name, place, kind in zip(plan.elements, plan.drawn, plan.kinds, strict=True)]
+    for number, (name, place, kind) in enumerate(boxes):
+        yield from _of_reach(name, place, kind, plan)
+        yield from _of_support(name, place, kind, [boxes[_number(plan, other)] for other in plan.elements[name].on])
+        for other, its_place, its_kind in boxes[:number]:
+            yield from _of_earlier(name, place, kind, other, its_place, its_kind)
+
+
+def _number(plan: Plan, name: str) -> int:
+    return list(plan.elements).index(name)
+
+
+def _of_reach(name: str, place: Position, kind: Kind, plan: Plan) -> Iterator[str]:
+    away = hypot(place[0] - ROBOT_BASE[0], place[1] - ROBOT_BASE[1])
+    if not NEAREST <= away <= FARTHEST:
+        yield (
+            f"The element '{name}' lies {away:.2f} m from the robot's base at x = {ROBOT_BASE[0]}, y = "
+            f"{ROBOT_BASE[1]:g}; the hand lays between {NEAREST} and {FARTHEST} m."
+        )
+        return
+    tops = [middle[2] + one.size[2] / 2 for middle, one in zip(plan.drawn, plan.kinds, strict=True)]
+    carried = max(0.0, *tops[: _number(plan, name)], 0.10) + CARRIED_OVER + kind.size[2] - HELD_BELOW
+    # The arm comes nearer with what it carries; straight over its place it has to reach as high as the others stand.
+    highest = highest_tcp(away)
+    if carried > highest:
+        yield (
+            f"The element '{name}' has to be carried {carried:.2f} m high over what is laid before it; {away:.2f} m "
+            f"from its base the arm reaches {highest:.2f} m."
+        )
+    for waiting, one in zip(supplies(plan), plan.kinds, strict=True):
+        beside = abs(place[1] - waiting[1]) - (kind.size[1] + one.size[1]) / 2
+        along = abs(place[0] - waiting[0]) - (kind.size[0] + one.size[0]) / 2
+        if max(beside, along) < APART:
+            yield f"The element '{name}' lies where elements wait, on the side of the robot where y is above 0."
+            return
+
+
+def _of_support(name: str, place: Position, kind: Kind, on: list[tuple[str, Position, Kind]]) -> Iterator[str]:
+    if not on:
+        return
+    for other, middle, one in on:
+        if any(abs(place[axis] - middle[axis]) >= (kind.size[axis] + one.size[axis]) / 2 for axis in (0, 1)):
+            yield f"The element '{name}' does not reach '{other}', which is to carry it: it would hang in the air."
+            return
+    tops = [middle[2] + one.size[2] / 2 for _, middle, one in on]
+    if max(tops) - min(tops) > LEANING:
+        yield f"The element '{name}' would lean: what carries it differs by {max(tops) - min(tops):.3f} m in height."
+    for axis in (0, 1):
+        ends = [
+            (
+                max(middle[axis] - one.size[axis] / 2, place[axis] - kind.size[axis] / 2),
+                min(middle[axis] + one.size[axis] / 2, place[axis] + kind.size[axis] / 2),
+            )
+            for _, middle, one in on
+        ]
+        if not min(low for low, _ in ends) < place[axis] < max(high for _, high in ends):
+            yield f"The element '{name}' would tip over: its middle is not between what carries it."
+            return
+
+
+def _of_earlier(
+    name: str, place: Position, kind: Kind, other: str, its_place: Position, its_kind: Kind
+) -> Iterator[str]:
+    """What stands between an element and one that is laid before it."""
+    gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
+    if max(gaps) < -CLOSE:
+        yield f"The elements '{other}' and '{name}' are in one place."
+        return
+    if max(gaps[:2]) < -CLOSE and its_place[2] > place[2]:
+        yield f"The element '{name}' lies below '{other}', which is laid before it."
+        return
+    tips = place[2] + kind.size[2] / 2 - HELD_BELOW - TIPS
+    is_high = its_place[2] + its_kind.size[2] / 2 > tips
+    along = abs(place[0] - its_place[0]) - (FINGER_WIDTH + its_kind.size[0]) / 2
+    across = abs(place[1] - its_place[1]) - its_kind.size[1] / 2
+    if is_high and along < 0 and across < FINGERS:
+        yield f"There is no room for the fingers at '{name}' beside '{other}': {FINGERS:.3f} m from its middle, in y."

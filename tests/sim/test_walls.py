@@ -1,0 +1,89 @@
+"""Walls in the simulator: sizes of their own, places that follow what lies there, and plans from files."""
+
+import numpy as np
+import pytest
+
+from lerobot_constructskill.contract import DEMO_SEED_START, get_task
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.plans.plan import KINDS, written
+
+pytestmark = pytest.mark.sim
+
+SEVEN = {
+    "a": {"kind": "brick", "at": [-0.34, -0.22]},
+    "b": {"kind": "brick", "beside": "a", "joint": 0.015},
+    "c": {"kind": "brick", "on": ["a"]},
+    "d": {"kind": "brick", "on": ["b"]},
+    "e": {"kind": "post", "at": [-0.10, -0.42]},
+    "f": {"kind": "post", "at": [0.04, -0.22]},
+    "g": {"kind": "brick", "on": ["c", "d"]},
+}
+"""Stack bond with a brick across, and two posts: a plan that is not shipped."""
+
+
+def sizes_of(env, seed):
+    env.reset(seed=seed)
+    return PrivilegedState(**env.privileged_state()).object_sizes.reshape(-1, 3)[: len(env._env.objects)]
+
+
+def test_every_episode_draws_sizes_within_the_standard_from_its_seed_alone():
+    env, other = (ConstructSkillEnv("course_of_three", render_backend="none") for _ in range(2))
+    drawn = {seed: sizes_of(env, seed) for seed in (1, 2, 3)}
+    np.testing.assert_array_equal(sizes_of(env, 1), drawn[1])
+    np.testing.assert_array_equal(sizes_of(other, 3), drawn[3])
+    nominal, most = np.array(KINDS["brick"].size), np.array(KINDS["brick"].deviations)
+    for sizes in drawn.values():
+        assert (abs(sizes - nominal) <= most + 1e-6).all() and len(np.unique(sizes[:, 0])) == 3
+    for one in (env, other):
+        one.close()
+
+
+def test_what_is_laid_moves_what_comes_after_and_what_is_knocked_off_is_next_again():
+    import torch
+    from mani_skill.utils.structs import Pose
+
+    env = ConstructSkillEnv("course_of_three", render_backend="none")
+    env.reset(seed=0)
+    scene, hold = env._env, np.array([0, 0, 0, 1], np.float32)
+
+    def put(number, place):
+        pose = Pose.create_from_pq(torch.tensor([place], dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]]))
+        scene.objects[number].set_pose(pose)
+        for _ in range(8):
+            *_, info = env.step(hold)
+        return PrivilegedState(**env.privileged_state()), info
+
+    before = PrivilegedState(**env.privileged_state())
+    assert before.number == 0 and before.count == 3 and not before.is_done
+    target = before.at(1).bin_position
+    off = before.bin_position + [0.003, -0.002, 0]
+    off[2] = before.object_size[2] / 2
+    after, info = put(0, off.tolist())
+    assert after.number == 1 and (info["chain"], info["placements"]) == (1, 1)
+    np.testing.assert_allclose(after.bin_position[:2] - target[:2], [0.003, -0.002], atol=5e-4)
+    again, info = put(0, [-0.5, 0.0, float(off[2])])
+    assert again.number == 0 and (info["chain"], info["placements"]) == (0, 0)
+    env.close()
+
+
+def test_a_plan_of_seven_from_a_file_is_laid_by_the_expert(tmp_path):
+    path = tmp_path / "seven.yaml"
+    path.write_text(written({"elements": SEVEN}))
+    task = get_task(f"plan:{path}")
+    env, expert = ConstructSkillEnv(task.name, render_backend="none"), make_expert(task, ExpertConfig())
+    frames, success = demonstrate(env, expert, NoiseConfig(sigma=0.0), DEMO_SEED_START)
+    env.close()
+    assert success and frames[-1]["sim.is_object"].sum() == 7
+    numbers = [int(frame["sim.placement"][0]) for frame in frames]
+    assert list(dict.fromkeys(numbers)) == list(range(7))
+
+
+def test_a_plan_that_cannot_be_built_is_refused_before_a_simulator_starts(tmp_path):
+    path = tmp_path / "far.yaml"
+    path.write_text(written({"elements": {"a": {"kind": "brick", "at": [0.9, -0.2]}}}))
+    with pytest.raises(InputError, match="'a' lies .* from the robot's base"):
+        ConstructSkillEnv(f"plan:{path}")
