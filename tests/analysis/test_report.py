@@ -1,5 +1,6 @@
 """The report of studies that were never run: what it says, what it refuses, and that nothing in it is markup."""
 
+import json
 import re
 import subprocess
 import sys
@@ -253,6 +254,24 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
     assert "What the spread between runs is made of" in said[False] and "figures/fixed_draws.png" in said[False]
     mean = {shared: re.search(r"5\.8 \(([\d.]+)–([\d.]+)\)", text).groups() for shared, text in said.items()}
     assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])
+
+
+def test_walls_are_told_by_their_chains_and_where_these_break(tmp_path, no_figures):
+    def laid(chain):
+        of_all = (
+            dict.fromkeys(("length", "level", "line")) if chain < 3 else {"length": 2.0, "level": -1.0, "line": 0.5}
+        )
+        return json.dumps({"errors": [[4.0 if chain == 3 else 2.0, 0.0, 0.0, 0.0, 0.0]] * 3} | of_all)
+
+    chains = {("one", 0): (3, 0), ("one", 1): (1, 1), ("two", 0): (0, 0), ("two", 1): (0, 0)}
+    rows = []
+    for row in study_rows(SMALL):
+        chain = chains[row.variant, row.training_seed][row.episode]
+        rows.append(replace(row, chain=chain, placements=chain, measures=laid(chain)))
+    report(ReportConfig(write_study(tmp_path, SMALL, rows)))
+    text = (tmp_path / "report.md").read_text()
+    assert "| one | 1.25 \\[1.00–1.50\\] | 1.25 | 1, 2, 0, 1 | 4.0 | 2.0 | 1.0 | 0.5 |" in text
+    assert "| two | 0.00 \\[0.00–0.00\\] | 0.00 | 4, 0, 0, 0 | – | – | – | – |" in text
 
 
 def test_declared_comparisons_are_the_family(tmp_path):

@@ -10,6 +10,7 @@ from lerobot_constructskill.analysis.stats.components import Components
 from lerobot_constructskill.analysis.stats.correlation import Correlation
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.analysis.stats.outcomes import Counts
+from lerobot_constructskill.analysis.stats.walls import Wall
 
 
 class Success(NamedTuple):
@@ -42,6 +43,7 @@ class VariantFindings:
         error: held-out error in m2, mean and range over seeds; None if it is unknown.
         errors_by_data: the same on each data set of the setting.
         components: what the spread of the share of placed episodes is made of, where that can be told.
+        wall: what was laid, where the task is a plan.
     """
 
     name: str
@@ -53,6 +55,7 @@ class VariantFindings:
     error: Estimate | None
     errors_by_data: dict[str, Estimate | None]
     components: Components | None
+    wall: Wall | None = None
 
     @property
     def seeds(self) -> int:
@@ -123,6 +126,11 @@ class SettingFindings:
     def drawn(self) -> list[VariantFindings]:
         """Variants whose draws, seeds and starts can be told apart."""
         return [one for one in self.variants if one.components]
+
+    @property
+    def walls(self) -> list[VariantFindings]:
+        """Variants and references whose episodes were measured as walls."""
+        return [one for one in self.everything if one.wall]
 
     @property
     def labels(self) -> dict[str, str]:

@@ -65,3 +65,8 @@ def error_range(estimate: Estimate | None) -> str:
         return "–"
     value, low, high = (f"{1e4 * error:.2f}" for error in estimate)
     return f"{value} [{low}–{high}]"
+
+
+def millimetres(value: float | None) -> str:
+    """A length in mm: "1.4"."""
+    return "–" if value is None else f"{value:.1f}"

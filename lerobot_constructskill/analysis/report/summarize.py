@@ -20,6 +20,7 @@ from lerobot_constructskill.analysis.stats.components import Components, split
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_draw, count, runs_of
+from lerobot_constructskill.analysis.stats.walls import wall_of
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Draws
 
@@ -140,6 +141,7 @@ def _variant(
         error=_mean_and_range(runs["heldout_mse_m2"]),
         errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
         components=None if episodes is None else _components(episodes),
+        wall=None if episodes is None else wall_of(episodes),
     )
 
 
