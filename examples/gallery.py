@@ -37,7 +37,7 @@ def main(names: Sequence[str]) -> None:
 
 def demonstration(task: Task) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """What the policy sees in every step of the expert's demonstration, and the close-ups of it."""
-    env, expert = ConstructSkillEnv(task.name), make_expert(task, ExpertConfig())
+    env, expert = ConstructSkillEnv(task.name, film=True), make_expert(task, ExpertConfig())
     seen, close_ups = [], []
 
     def keep(_, obs):

@@ -76,6 +76,7 @@ class ConstructSkillEnv(gym.Env):
         perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them; empty for none.
         perturb_seed: seed of what a perturbation draws once.
         cameras: those of `obs_type` that are rendered, all by default; one is faster than two, and shows the same.
+        film: `render` shows shadows and has 720 lines, which takes a CPU several times as long.
 
     Raises:
         ValueError: no such task, obs_type, render_backend, camera, axis or level, an episode_length below 1, or a
@@ -98,6 +99,7 @@ class ConstructSkillEnv(gym.Env):
         perturb: str = "",
         perturb_seed: Seed = 0,
         cameras: tuple[str, ...] | None = None,
+        film: bool = False,
     ):
         check_fields(ConstructSkillEnv.__init__, locals())
         self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed)
@@ -121,6 +123,7 @@ class ConstructSkillEnv(gym.Env):
             "light_robot": light_robot,
             "render_backend": render_backend,
             "perturbation": self._perturbation,
+            "film": film,
         }
         self._env = None
         self._steps: int | None = None  # of the episode; None where none has begun

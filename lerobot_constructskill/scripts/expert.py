@@ -63,7 +63,7 @@ def film(config: FilmConfig) -> str:
 
     out = config.out or Path("outputs") / f"{config.task}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())
-    env = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed)
+    env = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed, film=True)
     frames = []
 
     def watch(phase, obs):

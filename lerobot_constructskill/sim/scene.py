@@ -4,7 +4,9 @@ A task derives from `PickPlaceEnv`, loads its asset and, where the layout differ
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import cache
+from itertools import product
 
 import numpy as np
 import sapien
@@ -39,7 +41,7 @@ from lerobot_constructskill.sim.actions import HOLDING, Clipping, Hold
 from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.robot import LightPanda, QuickPanda, seen_from
-from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, textured
+from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, shining_sun, textured
 
 WALL = 0.005
 """Thickness of the bin's walls and floor, in metres (paper, section II)."""
@@ -57,6 +59,12 @@ PLACED_STEPS = 5
 """Consecutive steps inside the bin, gripper open, that make a placement (paper, section III)."""
 
 HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
+
+FILM_SIZE = 960, 720
+"""Width and height of a film's pictures, in pixels."""
+
+BAY, JOINT, JOINT_COLOUR = 1.0, 0.008, (0.22, 0.21, 0.20)
+"""Width of the slab's bays and of the joints between them, in metres, and the joints' RGB."""
 
 
 @cache
@@ -99,6 +107,7 @@ class PickPlaceEnv(BaseEnv):
         light_robot: draw the Panda with decimated meshes. By default only where frames are rendered on a CPU.
         robot_uids: ManiSkill's; the Panda by default, drawn as `light_robot` says.
         perturbation: what differs from the task as it is; nothing by default.
+        film: `render` shows shadows and has 720 lines, which takes a CPU several times as long.
         render_backend: ManiSkill's, or "auto": a GPU that can render, else Mesa's lavapipe.
 
     Raises:
@@ -141,8 +150,10 @@ class PickPlaceEnv(BaseEnv):
         control_mode: str = "pd_ee_delta_pose",
         render_backend: str = "auto",
         perturbation: Perturbation | None = None,
+        film: bool = False,
         **kwargs,
     ):
+        self.film = film
         self.draws = Draws(perturbation or Perturbation())
         if self.draws.perturbation.amount("size") and not self.is_brick:
             raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
@@ -215,7 +226,12 @@ class PickPlaceEnv(BaseEnv):
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
         pose = looking_from((0.9, -1.0, 0.8), (-0.1, -0.15, 0.15))
-        return CameraConfig("render_camera", pose=pose, width=512, height=512, fov=0.9)
+        width, height = FILM_SIZE if self.film else (512, 512)
+        return CameraConfig("render_camera", pose=pose, width=width, height=height, fov=0.9)
+
+    def render(self) -> torch.Tensor | np.ndarray:
+        with shining_sun(self.scene) if self.film else nullcontext():
+            return super().render()
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, sapien.Pose(p=ROBOT_BASE))
@@ -249,10 +265,13 @@ class PickPlaceEnv(BaseEnv):
         builder.add_plane_collision(sapien.Pose(q=euler2quat(0, -np.pi / 2, 0)))
         if self.scene.can_render():
             colour, pattern = self.draws.surface("ground", (150, 146, 138), 1)
-            screed = textured(mottled(colour, contrast=0.05, seed=pattern))
+            concrete = textured(mottled(colour, contrast=0.06, size=512, seed=pattern))
             plaster = textured(mottled((222, 217, 206), contrast=0.02, seed=2))
             w, h, t = HALL_HALF_WIDTH, HALL_HEIGHT / 2, 0.01
-            builder.add_box_visual(sapien.Pose([0, 0, -t]), [w, w, t], material=screed)
+            builder.add_box_visual(sapien.Pose([0, 0, -2 * t]), [w, w, t], material=JOINT_COLOUR)
+            half, middles = (BAY - JOINT) / 2, np.arange(-w, w + BAY, BAY)
+            for x, y in product(middles, middles):  # the slab, cast in bays
+                builder.add_box_visual(sapien.Pose([x, y, -t]), [half, half, t], material=concrete)
             for side in (-w, w):
                 builder.add_box_visual(sapien.Pose([side, 0, h]), [t, w, h], material=plaster)
                 builder.add_box_visual(sapien.Pose([0, side, h]), [w, t, h], material=plaster)

@@ -24,6 +24,10 @@ OPENING = 0.015
 
 SPRUCE = (205, 164, 110)
 
+CHALK = (0.10, 0.25, 0.60)
+LINE_LENGTH, BESIDE_LINE = 0.9, 0.01
+"""Length of a chalk line and its distance from the faces of what is laid along it, in metres."""
+
 
 class WallEnv(PickPlaceEnv):
     """
@@ -74,6 +78,25 @@ class WallEnv(PickPlaceEnv):
         self._sizes = torch.tensor(self.sizes, dtype=torch.float32, device=self.device)
         self._edges = [tuple(self._sizes[:, number].unbind(-1)) for number in range(len(self.objects))]
         self._targets = torch.zeros(self.num_envs, len(self.objects), 3, device=self.device)
+
+    def _load_hall(self) -> None:
+        super()._load_hall()
+        if self.scene.can_render():
+            builder = self.scene.create_actor_builder()
+            for x, y in self._lines():
+                builder.add_box_visual(sapien.Pose([x, y, 0]), [LINE_LENGTH / 2, 0.0015, 0.0005], material=CHALK)
+            builder.initial_pose = sapien.Pose()
+            builder.build_static(name="chalk_line")
+
+    def _lines(self) -> set[tuple[float, float]]:
+        """Middles of the lines that are snapped on the slab along the courses, x and y in metres."""
+        on_slab = [
+            (place, kind)
+            for place, kind, element in zip(self.plan.drawn, self.plan.kinds, self.plan.elements.values(), strict=True)
+            if not element.on
+        ]
+        middle = sum(place[0] for place, _ in on_slab) / len(on_slab)
+        return {(middle, round(place[1] - kind.size[1] / 2 - BESIDE_LINE, 4)) for place, kind in on_slab}
 
     def _draw_sizes(self) -> np.ndarray:
         """Sizes of all elements in metres, (num_envs, elements, 3), from the episodes' seeds."""
