@@ -74,6 +74,9 @@ POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 JOINTS = (*(f"panda_joint{number}" for number in range(1, 8)), "panda_finger_joint1", "panda_finger_joint2")
 """The Panda's seven arm joints, in rad and rad/s, and its two fingers, in m and m/s, as its URDF names them."""
 
+FINGERS = ("panda_leftfinger", "panda_rightfinger")
+"""The links of the two fingers."""
+
 MAX_PLACEMENTS = 9
 """Most objects that one task places; the privileged state has room for so many in every task."""
 
@@ -101,12 +104,15 @@ SIM_STATE = {
     "bin_interiors": _each("x", "y", "z"),
     "is_object": _each("is_object"),
     "is_placed": _each("is_placed"),
+    "finger_forces": tuple(f"{side}_{axis}" for side in ("left", "right") for axis in "xyz"),
+    "object_forces": _each("force"),
 }
 """Privileged state, name to the names of its numbers: SI units, world frame.
 
 A task is a list of placements. `object_*` and `bin_*` are of the next one, which is the first that is not done, or the
 last of all; `placement` is its number. The plurals are of all placements, in order; `is_object` says which numbers
-there are, the others are 0.
+there are, the others are 0. Forces are those at the end of the step before, in newtons: the net force on each finger,
+and the largest between each object and another body.
 """
 
 PLURALS = {

@@ -39,6 +39,8 @@ MEANINGS = {
     "sim.bin_interiors": "privileged: inner edges of that, m",
     "sim.is_object": "privileged: 1 for each object that there is, 0 for the rest of the nine",
     "sim.is_placed": "privileged: 1 for each object that is placed",
+    "sim.finger_forces": "privileged: net contact force on each finger, N, world frame",
+    "sim.object_forces": "privileged: largest contact force between each object and another body, N",
     "sim.seed": "seed of the episode's initial state and noise",
     "dagger.round": "the round in which the frame came about, 0 for demonstrations",
     "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",

@@ -38,6 +38,8 @@ PLACEMENT_COLUMNS = tuple(
         "bin_interiors",
         "is_object",
         "is_placed",
+        "finger_forces",
+        "object_forces",
     )
 )
 """Columns that data sets lack which were made before a task was a list of placements."""

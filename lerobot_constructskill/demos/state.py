@@ -57,6 +57,8 @@ class PrivilegedState:
     bin_interiors: np.ndarray | None = None
     is_object: np.ndarray | None = None
     is_placed: np.ndarray | None = None
+    finger_forces: np.ndarray | None = None
+    object_forces: np.ndarray | None = None
 
     @property
     def number(self) -> int:

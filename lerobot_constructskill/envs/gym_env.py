@@ -61,7 +61,8 @@ class ConstructSkillEnv(gym.Env):
     that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. The reward is
     the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of the
     scene, `clipped_steps`, how many of the episode's actions were clipped, `placements`, how many of the task's are
-    done, and `chain`, how many before the first that is not; after a reset also `contract`, as JSON.
+    done, `chain`, how many before the first that is not, and what was unsafe: `cost` of the step, and of the episode
+    `peak_force` (N), `drops`, `knocks` and `collisions`; after a reset also `contract`, as JSON.
 
     Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
@@ -303,9 +304,9 @@ class ConstructSkillEnv(gym.Env):
 
 
 def public_info(info: dict[str, Any]) -> dict[str, Any]:
-    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans and counts."""
+    """The part of ManiSkill's info that users get, tensors (num_envs,): booleans, counts and the cost."""
     booleans = {name: value for name, value in info.items() if name.startswith("is_")}
-    return {"is_success": info["success"], **booleans, **{name: info[name] for name in COUNTS}}
+    return {"is_success": info["success"], **booleans, **{name: info[name] for name in (*COUNTS, "cost")}}
 
 
 @functools.cache

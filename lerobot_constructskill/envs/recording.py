@@ -40,8 +40,8 @@ STARTING = (*ENVIRONMENT, "obs_type")
 OUTCOME = ("lifted", "placed", "stage", "lift_step", "place_step", "steps")
 """Fields of `Episode` that executing its actions again must reproduce."""
 
-COUNTS = ("clipped_steps", "placements", "chain")
-"""Entries of `info` that count, and fields of `Episode`."""
+COUNTS = ("clipped_steps", "placements", "chain", "peak_force", "drops", "knocks", "collisions")
+"""Entries of `info` about the episode so far, and fields of `Episode`."""
 
 DECIDING = ("sapien", "mani_skill", "numpy", "torch")
 """Packages that decide what an action does; torch has a part in the controller's kinematics."""
@@ -72,6 +72,11 @@ class Episode:
         placements: how many of the task's placements were done at the end; None if not counted.
         chain: how many of them before the first that was not done, in the order of the task.
         measures: JSON, how the elements of a plan lie at the end, as `plans.measure` says; None without a plan.
+        cost: sum of `info["cost"]`: what a step did that is unsafe, as counted below.
+        peak_force: largest force between an object and another body at the end of a step, in newtons.
+        drops: how often an object fell faster than 0.6 m/s.
+        knocks: how often an object that was placed was moved from its place.
+        collisions: steps after which the robot touched something with another link than its fingers.
         actions: every executed action in order, in pieces whose concatenation is (steps * A) float32, as
             `ConstructSkillEnv.step` takes them.
     """
@@ -95,13 +100,20 @@ class Episode:
     placements: int | None = None
     chain: int | None = None
     measures: str | None = None
+    cost: float | None = None
+    peak_force: float | None = None
+    drops: int | None = None
+    knocks: int | None = None
+    collisions: int | None = None
     actions: list[np.ndarray] = field(default_factory=list)
 
     def add(self, action: np.ndarray, info: Mapping[str, Any]) -> None:
         """Add an executed action, (A,), and what the environment returned as `info` for it."""
         self.actions.append(np.array(action, dtype=np.float32))
         self.steps += 1
-        self.clipped_steps, self.placements, self.chain = (info[name] for name in COUNTS)
+        for name in COUNTS:
+            setattr(self, name, info[name])
+        self.cost = (self.cost or 0.0) + info["cost"]
         if info["is_lifted"] and not self.lifted:
             self.lifted, self.lift_step = True, self.steps
         if info["is_success"] and not self.placed:  # a task may ask for more than the paper's placement
@@ -141,7 +153,7 @@ class Episode:
 ACTIONS = {list[np.ndarray]: pa.list_(pa.field("element", pa.float32(), nullable=False))}
 """Python's and Arrow's type of actions; `artifacts.tables` knows those of all other fields."""
 
-MEASURED = ("placements", "chain", "measures")
+MEASURED = ("placements", "chain", "measures", "cost", "peak_force", "drops", "knocks", "collisions")
 """Columns that older files lack."""
 
 RECORDED = Parquet("a recording", Episode, ACTIONS, json={"versions": VERSIONS}, added=MEASURED)

@@ -39,6 +39,7 @@ from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.sim.actions import HOLDING, Clipping, Hold
 from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
+from lerobot_constructskill.sim.contacts import Safety, touch
 from lerobot_constructskill.sim.perturb import Draws
 from lerobot_constructskill.sim.robot import LightPanda, QuickPanda, seen_from
 from lerobot_constructskill.sim.visuals import colour_shader, looking_from, mottled, shining_sun, textured
@@ -246,6 +247,7 @@ class PickPlaceEnv(BaseEnv):
         self._unmet: dict[str, torch.Tensor] = {}  # by condition: the last step in which it was not met
         self._lasted: dict[str, torch.Tensor] = {}
         self._clipping = Clipping(self.num_envs, self.device)
+        self._safety = Safety(self.num_envs, len(self.objects), self.device)
 
     def _load_placements(self) -> None:
         """Build `objects`, in the order in which they are placed, and where they go."""
@@ -347,6 +349,7 @@ class PickPlaceEnv(BaseEnv):
             kept = (self._is_placed, self._lifted, self._clipping.steps)
             for memory in (*kept, *self._unmet.values(), *self._lasted.values()):
                 memory[env_idx] = 0
+            self._safety.forget(env_idx)
 
     def _initialize_objects(self, env_idx: torch.Tensor) -> None:
         offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
@@ -384,6 +387,10 @@ class PickPlaceEnv(BaseEnv):
             if self.hold is not None:
                 action = self.hold.apply(action, self.agent.tcp.pose.q)
         return super()._step_action(action)
+
+    def _after_control_step(self) -> None:
+        upward = torch.stack([one.linear_velocity[:, 2] for one in self.objects], dim=1)
+        self._safety.judge(touch(self.scene, self.agent.robot.links_map, self.objects), upward)
 
     # Success
 
@@ -427,11 +434,12 @@ class PickPlaceEnv(BaseEnv):
         }
 
     def _progress(self) -> dict[str, torch.Tensor]:
-        """How many placements are done, how many of them before the first that is not, and what was clipped."""
+        """Placements that are done, how many before the first that is not, and what was clipped or went wrong."""
         return {
             "placements": self._is_placed.sum(dim=1),
             "chain": self._is_placed.long().cumprod(dim=1).sum(dim=1),
             "clipped_steps": self._clipping.steps.clone(),
+            **self._safety.info(),
         }
 
     def _lasts(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
@@ -496,6 +504,8 @@ class PickPlaceEnv(BaseEnv):
             "joint_velocities": self.agent.robot.get_qvel(),
             "placement": following[:, None].float(),
             "is_placed": _listed(self._is_placed[..., None].float()),
+            "finger_forces": self._safety.touch.fingers.flatten(1),
+            "object_forces": _listed(self._safety.touch.objects[..., None]),
             **listed,
             **{name: _listed(value) for name, value in moving.items()},
         }

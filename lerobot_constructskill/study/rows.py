@@ -143,7 +143,7 @@ class EpisodeRow:
         steps: length of the episode.
         clipped_steps: how many of its actions asked for more than the controller gives; null in rows from before these
             were counted.
-        placements, chain, measures: null in rows from before tasks were lists of placements.
+        placements, chain, measures, cost, peak_force, drops, knocks, collisions: null in older rows.
         error_kind: null where the run finished; `NOT_RUN`, or what kind of failure: "weights" (of a backbone, to be
             had nowhere), "input", "missing", "taken", "machine" or "fault". Such a run has one row, episode 0.
         error: why the run failed, one sentence.
@@ -170,6 +170,11 @@ class EpisodeRow:
     placements: int | None = None
     chain: int | None = None
     measures: str | None = None
+    cost: float | None = None
+    peak_force: float | None = None
+    drops: int | None = None
+    knocks: int | None = None
+    collisions: int | None = None
     error_kind: str | None = None
     error: str | None = None
     dataset_sha256: str | None = None

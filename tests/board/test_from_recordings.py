@@ -18,7 +18,7 @@ from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_r
 
 CONTROL = BoardSetting("block_to_bin", episodes=2, episode_length=2, first_start=7)
 SETTINGS = {"control": CONTROL, "block": replace(CONTROL, perturb="pose=1")}
-NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys(COUNTS, 0)
+NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys((*COUNTS, "cost"), 0)
 ABOUT = About(*["a test's"] * 7, observes="pixels")
 
 

@@ -61,7 +61,13 @@ class ToyEnv:
             "joint_positions": [0.1 * self.tcp[0], 0.4, 0, -2, 0, 2.4, 0.8, 0.04, 0.04],
             "joint_velocities": np.zeros(9),
         }
-        one = {"placement": [0], "is_object": [1], "is_placed": [float(self.settled >= 5)]}
+        one = {
+            "placement": [0],
+            "is_object": [1],
+            "is_placed": [float(self.settled >= 5)],
+            "finger_forces": [],
+            "object_forces": [],
+        }
         for singular in ("object_pose", "object_size", "object_mass", "bin_position", "bin_interior"):
             one[PLURALS[singular]] = state[singular]
         for name, value in one.items():

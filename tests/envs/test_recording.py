@@ -19,7 +19,7 @@ from lerobot_constructskill.envs.recording import (
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv
 from lerobot_constructskill.errors import InputError
 
-NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys(COUNTS, 0)
+NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys((*COUNTS, "cost"), 0)
 DOWN_OPEN = np.array([0.01, 0.02, -0.03, 1], dtype=np.float64)
 
 

@@ -81,7 +81,7 @@ class Scene:
         return {
             "success": torch.tensor(self.n >= self.ends),
             "is_lifted": torch.tensor([True] * 3),
-            **dict.fromkeys(COUNTS, torch.zeros(3)),
+            **dict.fromkeys((*COUNTS, "cost"), torch.zeros(3)),
         }
 
 

@@ -25,7 +25,7 @@ pytestmark = [pytest.mark.sim]
 IMAGE = PolicyFeature(FeatureType.VISUAL, (3, 224, 224))
 STEPS, SEEDS = 7, [1000, 1001]
 ENV = {"task": "block_to_bin", "episode_length": STEPS}  # a task whose initial state depends on the seed
-NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys(COUNTS, 0)
+NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys((*COUNTS, "cost"), 0)
 
 
 def random_agent(config, seed, **fields):

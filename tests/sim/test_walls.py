@@ -66,7 +66,7 @@ def test_what_is_laid_moves_what_comes_after_and_what_is_knocked_off_is_next_aga
     assert after.number == 1 and (info["chain"], info["placements"]) == (1, 1)
     np.testing.assert_allclose(after.bin_position[:2] - target[:2], [0.003, -0.002], atol=5e-4)
     again, info = put(0, [-0.5, 0.0, float(off[2])])
-    assert again.number == 0 and (info["chain"], info["placements"]) == (0, 0)
+    assert again.number == 0 and (info["chain"], info["placements"], info["knocks"]) == (0, 0, 1)
     env.close()
 
 
@@ -87,3 +87,33 @@ def test_a_plan_that_cannot_be_built_is_refused_before_a_simulator_starts(tmp_pa
     path.write_text(written({"elements": {"a": {"kind": "brick", "at": [0.9, -0.2]}}}))
     with pytest.raises(InputError, match="'a' lies .* from the robot's base"):
         ConstructSkillEnv(f"plan:{path}")
+
+
+def test_forces_and_what_is_unsafe_are_told_and_an_episode_begins_anew():
+    env, closing = ConstructSkillEnv("brick_to_bin", render_backend="none"), np.array([0, 0, 0, -1], np.float32)
+    expert, infos = make_expert(get_task("brick_to_bin"), ExpertConfig()), []
+    env.reset(seed=1)
+    state = PrivilegedState(**env.privileged_state())
+    assert not state.finger_forces.any() and not state.object_forces.any()
+    progress = expert.start(state)
+    while state.object_pose[2] < 0.2:
+        action, _, progress = expert.act(state, progress)
+        *_, info = env.step(action)
+        state = PrivilegedState(**env.privileged_state())
+    left, right = state.finger_forces.reshape(2, 3)
+    weight = 9.81 * state.object_mass[0]
+    assert left[1] * right[1] < 0 and abs(left[1]) > 20, "the jaws press from both sides"
+    assert -(left + right)[2] < weight * 3 and state.object_forces[0] == pytest.approx(np.linalg.norm(left), rel=0.2)
+    assert (info["drops"], info["cost"]) == (0, 0) and info["peak_force"] >= state.object_forces[0]
+    for _ in range(12):
+        *_, info = env.step(-closing)
+        infos.append(info)
+    assert info["drops"] == 1 and sum(one["cost"] for one in infos) >= 1
+    for _ in range(60):  # the hand into the ground
+        *_, info = env.step(np.array([0.02, 0.05, -0.08, -1], np.float32))
+    env.reset(seed=1)
+    *_, info = env.step(closing)
+    assert {name: info[name] for name in ("drops", "knocks", "collisions", "cost")} == dict.fromkeys(
+        ("drops", "knocks", "collisions", "cost"), 0
+    )
+    env.close()

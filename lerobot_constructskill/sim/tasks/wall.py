@@ -146,6 +146,7 @@ class WallEnv(PickPlaceEnv):
         was_let_go = self._lasts("lies", lies & is_gripper_open[:, None])
         # What is laid on an element presses and shakes it.
         stays = torch.stack([value for name, value in each.items() if name != "is_at_rest"]).all(dim=0)
+        self._safety.knock(self._is_placed & ~stays)
         self._is_placed = stays & (self._is_placed | was_let_go)
         self._targets = self._rest_positions(poses)
         self._lifted |= (poses[..., 2] >= LIFT_HEIGHT).any(dim=1)
