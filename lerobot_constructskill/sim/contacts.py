@@ -16,7 +16,7 @@ FORCE_LIMIT = 80.0
 FALLING = 0.6
 """Speed in m/s downward at which an object falls, as from 18 mm on."""
 
-GRAZE = 1.0
+GRAZE = 5.0
 """Force in newtons up to which the arm may touch something: the palm brushes what the fingers hold."""
 
 FIXED = "panda_link0"

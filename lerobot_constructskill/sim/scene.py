@@ -64,8 +64,8 @@ HALL_HALF_WIDTH, HALL_HEIGHT = 3.0, 3.0
 FILM_SIZE = 960, 720
 """Width and height of a film's pictures, in pixels."""
 
-BAY, JOINT, JOINT_COLOUR = 1.0, 0.008, (0.22, 0.21, 0.20)
-"""Width of the slab's bays and of the joints between them, in metres, and the joints' RGB."""
+BAYS, BAY, JOINT = 3, 2.0, 0.008
+"""Of the slab: bays a side, their width and that of the joints between them, in metres."""
 
 
 @cache
@@ -267,12 +267,11 @@ class PickPlaceEnv(BaseEnv):
         builder.add_plane_collision(sapien.Pose(q=euler2quat(0, -np.pi / 2, 0)))
         if self.scene.can_render():
             colour, pattern = self.draws.surface("ground", (150, 146, 138), 1)
-            concrete = textured(mottled(colour, contrast=0.06, size=512, seed=pattern))
+            concrete = textured(mottled(colour, contrast=0.06, seed=pattern))
             plaster = textured(mottled((222, 217, 206), contrast=0.02, seed=2))
             w, h, t = HALL_HALF_WIDTH, HALL_HEIGHT / 2, 0.01
-            builder.add_box_visual(sapien.Pose([0, 0, -2 * t]), [w, w, t], material=JOINT_COLOUR)
-            half, middles = (BAY - JOINT) / 2, np.arange(-w, w + BAY, BAY)
-            for x, y in product(middles, middles):  # the slab, cast in bays
+            half, middles = (BAY - JOINT) / 2, BAY * (np.arange(BAYS) - (BAYS - 1) / 2)
+            for x, y in product(middles, middles):  # the slab; joints are open, and black
                 builder.add_box_visual(sapien.Pose([x, y, -t]), [half, half, t], material=concrete)
             for side in (-w, w):
                 builder.add_box_visual(sapien.Pose([side, 0, h]), [t, w, h], material=plaster)
