@@ -22,6 +22,8 @@ from lerobot_constructskill.lerobot_internals import write_video
 
 ROOT = Path(__file__).parents[1]
 SIDE = 224
+LONGEST = 400
+"""Frames of a film."""
 
 
 def main(names: Sequence[str]) -> None:
@@ -31,7 +33,8 @@ def main(names: Sequence[str]) -> None:
         seen, close_ups = demonstration(task)
         tiles = (seen[0], close_ups[len(close_ups) // 2], close_ups[-1])
         Image.fromarray(beside(*tiles)).save(ROOT / "examples" / "pictures" / f"{task.name}.jpg", quality=85)
-        pairs = zip(seen, close_ups, strict=True)
+        faster = -(-len(seen) // LONGEST)  # a wall takes more than a minute
+        pairs = zip(seen[::faster], close_ups[::faster], strict=True)
         write_video(ROOT / "docs" / "films" / f"{task.name}.mp4", [beside(*pair) for pair in pairs], FPS)
 
 
@@ -50,8 +53,10 @@ def demonstration(task: Task) -> tuple[list[np.ndarray], list[np.ndarray]]:
 
 
 def beside(*images: np.ndarray) -> np.ndarray:
-    """Images in one row, each `SIDE` pixels high and wide."""
-    return np.concatenate([np.asarray(Image.fromarray(image).resize((SIDE, SIDE))) for image in images], axis=1)
+    """Images in one row, each `SIDE` pixels high."""
+    scaled = [(SIDE * image.shape[1] // image.shape[0] // 2 * 2, SIDE) for image in images]
+    pairs = zip(images, scaled, strict=True)
+    return np.concatenate([np.asarray(Image.fromarray(image).resize(size)) for image, size in pairs], axis=1)
 
 
 if __name__ == "__main__":

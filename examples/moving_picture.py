@@ -27,9 +27,9 @@ def main(films: str = "docs/films", out: str = "examples/pictures/tasks.gif") ->
 
 
 def close_ups(film: Path) -> list[np.ndarray]:
-    """The right half of every third frame, and of the last one."""
+    """The close-up, right of the square that a policy sees, in every third frame and the last one."""
     seen = frames(film)
-    return [frame[:, frame.shape[1] // 2 :] for frame in (*seen[::EVERY], seen[-1])]
+    return [frame[:, frame.shape[0] :] for frame in (*seen[::EVERY], seen[-1])]
 
 
 if __name__ == "__main__":

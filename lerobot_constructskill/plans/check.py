@@ -13,7 +13,7 @@ NEAREST, FARTHEST = 0.30, 0.76
 CARRIED_OVER, HELD_BELOW = 0.04, 0.03
 """Height in metres at which an element is carried over all others, and of the TCP below an element's top."""
 
-FINGERS, FINGER_WIDTH, TIPS = 0.062, 0.022, 0.012
+JAWS, FINGER_WIDTH, TIPS = 0.062, 0.022, 0.012
 """In metres: from the TCP along the jaws to the outside of an open finger, a finger's width, and its tip below it."""
 
 CLOSE = 0.0005
@@ -61,17 +61,17 @@ def _of_reach(name: str, place: Position, kind: Kind, plan: Plan) -> Iterator[st
         )
         return
     tops = [middle[2] + one.size[2] / 2 for middle, one in zip(plan.drawn, plan.kinds, strict=True)]
-    carried = max(0.0, *tops[: _number(plan, name)], 0.10) + CARRIED_OVER + kind.size[2] - HELD_BELOW
-    # The arm comes nearer with what it carries; straight over its place it has to reach as high as the others stand.
+    waiting = max(one.size[2] for one in plan.kinds)
+    carried = max([waiting, *tops[: _number(plan, name)]]) + CARRIED_OVER + kind.size[2] - HELD_BELOW
     highest = highest_tcp(away)
     if carried > highest:
         yield (
             f"The element '{name}' has to be carried {carried:.2f} m high over what is laid before it; {away:.2f} m "
             f"from its base the arm reaches {highest:.2f} m."
         )
-    for waiting, one in zip(supplies(plan), plan.kinds, strict=True):
-        beside = abs(place[1] - waiting[1]) - (kind.size[1] + one.size[1]) / 2
-        along = abs(place[0] - waiting[0]) - (kind.size[0] + one.size[0]) / 2
+    for start, one in zip(supplies(plan), plan.kinds, strict=True):
+        beside = abs(place[1] - start[1]) - (kind.size[1] + one.size[1]) / 2
+        along = abs(place[0] - start[0]) - (kind.size[0] + one.size[0]) / 2
         if max(beside, along) < APART:
             yield f"The element '{name}' lies where elements wait, on the side of the robot where y is above 0."
             return
@@ -115,5 +115,5 @@ def _of_earlier(
     is_high = its_place[2] + its_kind.size[2] / 2 > tips
     along = abs(place[0] - its_place[0]) - (FINGER_WIDTH + its_kind.size[0]) / 2
     across = abs(place[1] - its_place[1]) - its_kind.size[1] / 2
-    if is_high and along < 0 and across < FINGERS:
-        yield f"There is no room for the fingers at '{name}' beside '{other}': {FINGERS:.3f} m from its middle, in y."
+    if is_high and along < 0 and across < JAWS:
+        yield f"There is no room for the fingers at '{name}' beside '{other}': {JAWS:.3f} m from its middle, in y."

@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property, reduce
+from functools import cached_property, reduce
 from typing import Annotated, Any
+
+import yaml
 
 from lerobot_constructskill.bounds import Among, Range, Word, check
 from lerobot_constructskill.contract import BRICK, MAX_PLACEMENTS
@@ -188,7 +190,6 @@ def _larger(a: Any, b: Any) -> Any:
 PLAN = Yaml("a plan", Plan)
 
 
-@cache
 def read_plan(name: str) -> Plan:
     """The plan in `configs/plan` that is called `name`, or in the file `name`.
 
@@ -220,6 +221,4 @@ SUPPLIES = (
 
 def written(plan: Mapping[str, Any]) -> str:
     """A plan's facts as the YAML that `read_plan` reads."""
-    import yaml
-
     return yaml.safe_dump(plan, sort_keys=False, allow_unicode=True, width=110)

@@ -41,12 +41,12 @@ class Touch:
 def touch(scene: ManiSkillScene, links: dict[str, Link], objects: list[Actor]) -> Touch:
     """The contacts of every environment. On a GPU forces on an object are those with all bodies together."""
     fingers = [links[name] for name in FINGERS]
-    others = [link for name, link in links.items() if name not in (*FINGERS, FIXED)]
+    others = [link for name, link in links.items() if not name.startswith((*FINGERS, FIXED))]  # pads are fingers too
     if scene.gpu_sim_enabled:
-        net = [
+        on_fingers, on_objects, on_arm = (
             torch.stack([one.get_net_contact_forces() for one in some], dim=1) for some in (fingers, objects, others)
-        ]
-        return Touch(net[0], net[1].norm(dim=-1), (net[2].norm(dim=-1) > 0).any(dim=1))
+        )
+        return Touch(on_fingers, on_objects.norm(dim=-1), (on_arm.norm(dim=-1) > GRAZE).any(dim=1))
     between: dict[tuple[int, int], np.ndarray] = {}
     for contact in scene.sub_scenes[0].get_contacts():
         a, b = contact.bodies
