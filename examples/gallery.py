@@ -22,7 +22,7 @@ from lerobot_constructskill.lerobot_internals import write_video
 
 ROOT = Path(__file__).parents[1]
 SIDE = 224
-LONGEST = 300
+LONGEST = 280
 """Frames of a film."""
 
 

@@ -6,6 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
+from lerobot_constructskill.contract import MAX_PLACEMENTS, PLURALS
+
 JAW = 0.08
 """How far the Panda's jaws open, in metres."""
 
@@ -79,15 +81,11 @@ class PrivilegedState:
         """The same state with the placement `number` in place of the next one."""
         if number == self.number:
             return self
-        return replace(
-            self,
-            placement=np.array([number], np.float32),
-            object_pose=self.object_poses.reshape(-1, 7)[number],
-            object_size=self.object_sizes.reshape(-1, 3)[number],
-            object_mass=self.object_masses[number : number + 1],
-            bin_position=self.bin_positions.reshape(-1, 3)[number],
-            bin_interior=self.bin_interiors.reshape(-1, 3)[number],
-        )
+        own = {
+            singular: np.reshape(getattr(self, plural), (MAX_PLACEMENTS, -1))[number]
+            for singular, plural in PLURALS.items()
+        }
+        return replace(self, placement=np.array([number], np.float32), **own)
 
     def others(self) -> Iterator["PrivilegedState"]:
         """The state at every other placement."""

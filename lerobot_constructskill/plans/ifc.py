@@ -75,7 +75,7 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         raise MissingError(remedy_of(error) or str(error)) from error
     try:
         model = ifcopenshell.open(str(path))
-        parts = model.by_type("IfcElement")
+        parts: Any = model.by_type("IfcElement")
     except (RuntimeError, OSError, AttributeError, ifcopenshell.Error) as error:
         raise InputError(f"'{path}' is not an IFC file ({' '.join(str(error).split())[:100]}).") from None
     settings = ifcopenshell.geom.settings()
@@ -84,7 +84,7 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         if part.Representation is None:
             continue
         try:
-            shape = ifcopenshell.geom.create_shape(settings, part)
+            shape: Any = ifcopenshell.geom.create_shape(settings, part)
         except RuntimeError as error:
             raise InputError(f"The shape of '{part.Name}' in '{path}' cannot be computed ({error}).") from None
         matrix = ifcopenshell.util.shape.get_shape_matrix(shape)

@@ -28,8 +28,8 @@ def measure(plan: Plan, sim: Mapping[str, np.ndarray]) -> dict[str, Any]:
     count = len(plan.elements)
     poses, sizes = sim["object_poses"].reshape(-1, 7)[:count], sim["object_sizes"].reshape(-1, 3)[:count]
     places, interiors = sim["bin_positions"].reshape(-1, 3)[:count], sim["bin_interiors"].reshape(-1, 3)[:count]
-    is_placed, drawn = sim["is_placed"][:count] > 0, np.array(plan.drawn)
-    resting = places + [[0, 0, 1]] * (sizes - interiors) / 2
+    is_placed, drawn = sim["is_placed"][:count] > 0, np.array(plan.drawn, dtype=float)
+    resting = places + np.array([0, 0, 1]) * (sizes - interiors) / 2
     w, x, y, z = poses[:, 3:].T.astype(float)
     tilts = np.arccos(np.clip(1 - 2 * (x * x + y * y), -1, 1))
     turns = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

@@ -65,7 +65,7 @@ class Element:
     joint: Annotated[float, Range(0, 0.5, unit="m")] = 0.010
     on: list[str] = field(default_factory=list)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check(self)
 
     @property
@@ -97,7 +97,7 @@ class Plan:
     tolerance: Annotated[float, Range(0.001, 0.05, unit="m")] = 0.005
     standard: str = ""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         check(self)
         if not 1 <= len(self.elements) <= MAX_PLACEMENTS:
             raise InputError(f"A plan has 1 to {MAX_PLACEMENTS} elements, not {len(self.elements)}.")

@@ -48,7 +48,7 @@ def plan(config: PlanConfig) -> str:
     """
     from lerobot_constructskill.plans.check import complaints
 
-    read = _of_ifc(config) if config.out else read_plan(config.plan)
+    read = _of_ifc(config, config.out) if config.out else read_plan(config.plan)
     if config.picture:
         from lerobot_constructskill.plans.picture import draw_plan
 
@@ -61,10 +61,11 @@ def plan(config: PlanConfig) -> str:
     return f"{config.plan}: {plural(len(read.elements), 'element')}, can be built by this robot.{made}{drawn}"
 
 
-def _of_ifc(config: PlanConfig) -> Plan:
+def _of_ifc(config: PlanConfig, out: Path) -> Plan:
+    """Write the plan of an IFC file and read it."""
     from lerobot_constructskill.plans.ifc import plan_of
 
-    facts = plan_of(Path(config.plan), config.origin and (config.origin[0], config.origin[1]))
-    with replaced(config.out) as partial:
+    facts = plan_of(Path(config.plan), (config.origin[0], config.origin[1]) if config.origin else None)
+    with replaced(out) as partial:
         partial.write_text(f"# Made of {Path(config.plan).name}.\n{written(facts)}", encoding="utf-8")
-    return read_plan(str(config.out))
+    return read_plan(str(out))

@@ -74,7 +74,6 @@ class Safety:
     """
 
     def __init__(self, num_envs: int, count: int, device: torch.device):
-        numbers = {"dtype": torch.int32, "device": device}
         self.touch = Touch(
             torch.zeros(num_envs, len(FINGERS), 3, device=device),
             torch.zeros(num_envs, count, device=device),
@@ -82,7 +81,9 @@ class Safety:
         )
         self.falling = torch.zeros(num_envs, count, dtype=torch.bool, device=device)
         self.peak_force, self.cost = torch.zeros(num_envs, device=device), torch.zeros(num_envs, device=device)
-        self.drops, self.knocks, self.collisions = (torch.zeros(num_envs, **numbers) for _ in range(3))
+        self.drops, self.knocks, self.collisions = (
+            torch.zeros(num_envs, dtype=torch.int32, device=device) for _ in range(3)
+        )
 
     def judge(self, touch: Touch, speeds: torch.Tensor) -> None:
         """Count what a step did.

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Actor, Pose
 
 from lerobot_constructskill.contract import PLAN_TASK, SHIPPED
 from lerobot_constructskill.plans.check import check_plan
-from lerobot_constructskill.plans.plan import Kind, Plan, read_plan, supplies
+from lerobot_constructskill.plans.plan import Kind, Plan, Position, read_plan, supplies
 from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.scene import FINGER_OPEN, LIFT_HEIGHT, PickPlaceEnv
 from lerobot_constructskill.sim.strict import DEPTH_TOLERANCE, fits
@@ -59,11 +59,8 @@ class WallEnv(PickPlaceEnv):
     def __init__(self, *args, plan: str = "course_of_three", **kwargs):
         self.plan: Plan = read_plan(plan)
         check_plan(self.plan)
+        self.object_center = next(supplies(self.plan))
         super().__init__(*args, reconfiguration_freq=1, **kwargs)  # each episode has sizes of its own
-
-    @property
-    def object_center(self) -> tuple[float, float]:
-        return next(supplies(self.plan))
 
     @property
     def ways(self) -> list[tuple[Sequence[float], Sequence[float]]]:
@@ -76,7 +73,8 @@ class WallEnv(PickPlaceEnv):
         self.objects = [self._build(number, kind) for number, kind in enumerate(self.plan.kinds)]
         self.object = self.objects[0]
         self._sizes = torch.tensor(self.sizes, dtype=torch.float32, device=self.device)
-        self._edges = [tuple(self._sizes[:, number].unbind(-1)) for number in range(len(self.objects))]
+        x, y, z = self._sizes.unbind(-1)
+        self._edges: list[Position] = [*zip(x.unbind(-1), y.unbind(-1), z.unbind(-1), strict=True)]
         self._targets = torch.zeros(self.num_envs, len(self.objects), 3, device=self.device)
 
     def _load_hall(self) -> None:
@@ -118,9 +116,9 @@ class WallEnv(PickPlaceEnv):
 
     def _add_element(self, builder: ActorBuilder, kind: Kind, size: np.ndarray) -> None:
         if kind.factor:
-            add_brick(self, builder, 0.0, size)
+            add_brick(self, builder, 0.0, size.tolist())
         else:
-            self._add_box(builder, [0, 0, 0], size, mottled(SPRUCE, contrast=0.06, seed=2), kind.density)
+            self._add_box(builder, [0, 0, 0], size.tolist(), mottled(SPRUCE, contrast=0.06, seed=2), kind.density)
 
     # Initial state
 
