@@ -71,10 +71,11 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         import ifcopenshell
         import ifcopenshell.geom
         import ifcopenshell.util.shape
+        from ifcopenshell import open as read_ifc
     except ModuleNotFoundError as error:
         raise MissingError(remedy_of(error) or str(error)) from error
     try:
-        model = ifcopenshell.open(str(path))
+        model = read_ifc(str(path))
         parts: Any = model.by_type("IfcElement")
     except (RuntimeError, OSError, AttributeError, ifcopenshell.Error) as error:
         raise InputError(f"'{path}' is not an IFC file ({' '.join(str(error).split())[:100]}).") from None

@@ -8,7 +8,7 @@ from lerobot_constructskill.scripts.expert import FilmConfig, film
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 
-@pytest.mark.parametrize(("view", "size"), [("close", (512, 512)), ("policy", (224, 224))])
+@pytest.mark.parametrize(("view", "size"), [("close", (720, 960)), ("policy", (224, 224))])
 def test_an_episode_is_filmed_from_its_start_to_its_end(view, size, tmp_path):
     said = film(FilmConfig(out=tmp_path / "film.mp4", view=view))
     video = VideoDecoder(tmp_path / "film.mp4")
