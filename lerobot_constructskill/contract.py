@@ -335,35 +335,22 @@ SHIPPED = {
             scene=f"{_SCENES}.tenon:TenonToMortiseEnv",
             expert=_PRECISE,
         ),
-        Task(
-            name="course_of_three",
-            env_id="ConstructionCourseOfThree-v1",
-            instruction="Lay the three bricks end to end, with joints of ten millimetres.",
-            horizon=1200,
-            scene=f"{_SCENES}.wall:WallEnv",
-            expert=_LAYING,
-            noisy_yield=0.6,
-            plan="course_of_three",
-        ),
-        Task(
-            name="bond_of_five",
-            env_id="ConstructionBondOfFive-v1",
-            instruction="Lay three bricks end to end and the other two on their joints.",
-            horizon=2000,
-            scene=f"{_SCENES}.wall:WallEnv",
-            expert=_LAYING,
-            noisy_yield=0.6,
-            plan="bond_of_five",
-        ),
-        Task(
-            name="lintel_on_posts",
-            env_id="ConstructionLintelOnPosts-v1",
-            instruction="Set up the two posts and lay the beam across them.",
-            horizon=1200,
-            scene=f"{_SCENES}.wall:WallEnv",
-            expert=_LAYING,
-            noisy_yield=0.6,
-            plan="lintel_on_posts",
+        *(
+            Task(
+                name=name,
+                env_id=f"Construction{''.join(part.title() for part in name.split('_'))}-v1",
+                instruction=instruction,
+                horizon=horizon,
+                scene=f"{_SCENES}.wall:WallEnv",
+                expert=_LAYING,
+                noisy_yield=0.6,
+                plan=name,
+            )
+            for name, horizon, instruction in (
+                ("course_of_three", 1200, "Lay the three bricks end to end, with joints of ten millimetres."),
+                ("bond_of_five", 2000, "Lay three bricks end to end and the other two on their joints."),
+                ("lintel_on_posts", 1200, "Set up the two posts and lay the beam across them."),
+            )
         ),
     )
 }
@@ -402,6 +389,11 @@ def __getattr__(name: str) -> Any:
     if name == "TASKS":
         return _all_tasks()
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def label_of(task: str) -> str:
+    """A task's name as it can stand in the name of a file, where that of a plan may be a path."""
+    return re.sub(r"[^\w.-]", "_", task)
 
 
 def get_task(name: str) -> Task:

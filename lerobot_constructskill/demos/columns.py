@@ -7,7 +7,7 @@ bear those names.
 from collections.abc import Iterable
 from typing import Any, TypedDict
 
-from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, SIM_STATE, STATE_NAMES, Task
+from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, PLURALS, SIM_STATE, STATE_NAMES, Task
 from lerobot_constructskill.files import Json
 
 ACTORS = EXPERT, LEARNER = "expert", "learner"
@@ -29,18 +29,7 @@ JOINT_COLUMNS = ("sim.joint_positions", "sim.joint_velocities")
 
 PLACEMENT_COLUMNS = tuple(
     f"sim.{name}"
-    for name in (
-        "placement",
-        "object_poses",
-        "object_sizes",
-        "object_masses",
-        "bin_positions",
-        "bin_interiors",
-        "is_object",
-        "is_placed",
-        "finger_forces",
-        "object_forces",
-    )
+    for name in ("placement", *PLURALS.values(), "is_object", "is_placed", "finger_forces", "object_forces")
 )
 """Columns that data sets lack which were made before a task was a list of placements."""
 

@@ -5,12 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import ROBOT_BASE
-from lerobot_constructskill.demos.expert import ExpertProgress, Phase
 from lerobot_constructskill.demos.precise import PreciseExpert
 from lerobot_constructskill.demos.state import PrivilegedState
-
-RISEN_CLEAR = 0.10
-"""Height in metres of the TCP over a laid element at which the hand turns to the next one."""
 
 FULL_LEVER = 0.65
 """Distance in metres from the robot's base at which `ExpertConfig.compliance` was measured."""
@@ -24,6 +20,7 @@ class LayingExpert(PreciseExpert):
     """Begins anew with the next placement, and keeps out of the way of all that stands."""
 
     release_gap = 0.002
+    _clear_height = 0.10
 
     def _underside(self, state: PrivilegedState) -> float:
         """Height of the middle of the underside in metres.
@@ -33,14 +30,9 @@ class LayingExpert(PreciseExpert):
         """
         return state.object_pose[2] - state.object_size[2] / 2
 
-    def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
-        risen = state.tcp[2] - (state.object_pose[2] + state.object_size[2] / 2)
-        return after.phase is Phase.RELEASE and risen > RISEN_CLEAR
-
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
         """From the object's centre to the point where its underside is `release_clearance` above all others, (3,)."""
-        highest = max([float(state.rim), *(other.top for other in state.others())])
-        above = highest + self.config.release_clearance + state.object_size[2] / 2
+        above = _highest(float(state.rim), state) + self.config.release_clearance + state.object_size[2] / 2
         return np.array([*state.bin_position[:2], above]) - state.object_pose[:3]
 
     def _hold_up(self, step: np.ndarray, state: PrivilegedState) -> np.ndarray:
@@ -56,4 +48,9 @@ class LayingExpert(PreciseExpert):
     # Advice
 
     def _obstacle(self, state: PrivilegedState, grasp: np.ndarray) -> float:
-        return max([state.obstacle, *(other.top for other in state.others())])
+        return _highest(state.obstacle, state)
+
+
+def _highest(height: float, state: PrivilegedState) -> float:
+    """`height`, or that of the highest of all other objects, in metres."""
+    return max([height, *(other.top for other in state.others())])

@@ -103,7 +103,8 @@ class PickPlaceExpert:
             case Phase.DESCEND:
                 return self._grasp_point(state)
             case Phase.LIFT:
-                return _within_reach(progress.anchor + [0, 0, self.config.lift_height])
+                lifted = progress.anchor + [0, 0, self.config.lift_height]
+                return np.array([*lifted[:2], min(lifted[2], self._highest(lifted))])
         raise RuntimeError(f"{progress.phase} has no target.")
 
     def _grasp_point(self, state: PrivilegedState) -> np.ndarray:
@@ -122,7 +123,7 @@ class PickPlaceExpert:
 
     def _highest(self, point: np.ndarray) -> float:
         """Height that the hand reaches over `point`, in metres."""
-        return float(_within_reach(np.array([*point[:2], np.inf]))[2])
+        return highest_tcp(np.hypot(*(point[:2] - ROBOT_BASE[:2])))
 
     def _carry_error(self, state: PrivilegedState) -> np.ndarray:
         """From the hand to the point over the bin's centre where the object is `release_clearance` above the rim."""
@@ -241,8 +242,3 @@ class PickPlaceExpert:
         """The progress of a phase that has just begun, with the object taken from the ground where the hand is."""
         height = state.object_size[2] - self.config.finger_depth
         return ExpertProgress(phase, 0, np.array([*state.tcp[:2], height]))
-
-
-def _within_reach(point: np.ndarray) -> np.ndarray:
-    """`point`, (3,) metres, or the highest one below it that the arm reaches."""
-    return np.array([*point[:2], min(point[2], highest_tcp(np.hypot(*(point[:2] - ROBOT_BASE[:2]))))])

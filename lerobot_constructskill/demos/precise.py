@@ -65,7 +65,12 @@ class PreciseExpert(PickPlaceExpert):
     def _is_last(self, state: PrivilegedState, after: ExpertProgress) -> bool:
         """Whether the hand has risen well clear of the object."""
         risen = state.tcp[2] - (state.object_pose[2] + state.object_size[2] / 2)
-        return after.phase is Phase.RELEASE and risen > self.config.pregrasp_clearance
+        return after.phase is Phase.RELEASE and risen > self._clear_height
+
+    @property
+    def _clear_height(self) -> float:
+        """Height in metres of the TCP over a placed object at which the hand is done with it."""
+        return self.config.pregrasp_clearance
 
     def _action(self, state: PrivilegedState, progress: ExpertProgress) -> np.ndarray:
         return self._release(state) if progress.phase is Phase.RELEASE else super()._action(state, progress)

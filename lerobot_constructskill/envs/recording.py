@@ -7,7 +7,6 @@ runs it: `lerobot-eval`, an evaluation harness, a loop of one's own. A study kee
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +21,7 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
-from lerobot_constructskill.contract import STAGES, get_task
+from lerobot_constructskill.contract import STAGES, get_task, label_of
 from lerobot_constructskill.perturbations import Perturbation
 
 FOLDER = "CONSTRUCTSKILL_RECORD"
@@ -145,8 +144,7 @@ class Episode:
         """Write a file of its own, named by what is in it: an equal episode is the same file."""
         hashed = hashlib.sha256(self.flat.tobytes()).hexdigest()[:12]
         label = Perturbation(self.perturb, self.perturb_seed).label
-        task = re.sub(r"[^\w.-]", "_", self.task)  # a plan may be a file
-        name = f"{task}{label}-{self.episode_length}-{self.evaluation_seed}-{hashed}.parquet"
+        name = f"{label_of(self.task)}{label}-{self.episode_length}-{self.evaluation_seed}-{hashed}.parquet"
         write_recordings([self], folder / name)
 
 

@@ -26,6 +26,10 @@ APART = 0.12
 """Distance in metres across the wall that an element keeps from those that wait."""
 
 
+type Box = tuple[str, Position, Kind]
+"""Name, middle and kind of an element."""
+
+
 def check_plan(plan: Plan) -> None:
     """Refuse a plan that cannot be built.
 
@@ -40,19 +44,16 @@ def check_plan(plan: Plan) -> None:
 
 def complaints(plan: Plan) -> Iterator[str]:
     """Sentences about what cannot be built, in the order of laying."""
-    boxes = [(name, place, kind) for name, place, kind in zip(plan.elements, plan.drawn, plan.kinds, strict=True)]
-    for number, (name, place, kind) in enumerate(boxes):
-        yield from _of_reach(name, place, kind, plan)
-        yield from _of_support(name, place, kind, [boxes[_number(plan, other)] for other in plan.elements[name].on])
-        for other, its_place, its_kind in boxes[:number]:
-            yield from _of_earlier(name, place, kind, other, its_place, its_kind)
+    laid: list[Box] = []
+    for box in zip(plan.elements, plan.drawn, plan.kinds, strict=True):
+        yield from _of_reach(*box, laid, plan)
+        yield from _of_support(*box, [other for other in laid if other[0] in plan.elements[box[0]].on])
+        for other in laid:
+            yield from _of_earlier(*box, *other)
+        laid.append(box)
 
 
-def _number(plan: Plan, name: str) -> int:
-    return list(plan.elements).index(name)
-
-
-def _of_reach(name: str, place: Position, kind: Kind, plan: Plan) -> Iterator[str]:
+def _of_reach(name: str, place: Position, kind: Kind, laid: list[Box], plan: Plan) -> Iterator[str]:
     away = hypot(place[0] - ROBOT_BASE[0], place[1] - ROBOT_BASE[1])
     if not NEAREST <= away <= FARTHEST:
         yield (
@@ -60,9 +61,8 @@ def _of_reach(name: str, place: Position, kind: Kind, plan: Plan) -> Iterator[st
             f"{ROBOT_BASE[1]:g}; the hand lays between {NEAREST} and {FARTHEST} m."
         )
         return
-    tops = [middle[2] + one.size[2] / 2 for middle, one in zip(plan.drawn, plan.kinds, strict=True)]
-    waiting = max(one.size[2] for one in plan.kinds)
-    carried = max([waiting, *tops[: _number(plan, name)]]) + CARRIED_OVER + kind.size[2] - HELD_BELOW
+    stands = [*(one.size[2] for one in plan.kinds), *(middle[2] + one.size[2] / 2 for _, middle, one in laid)]
+    carried = max(stands) + CARRIED_OVER + kind.size[2] - HELD_BELOW
     highest = highest_tcp(away)
     if carried > highest:
         yield (
@@ -77,7 +77,7 @@ def _of_reach(name: str, place: Position, kind: Kind, plan: Plan) -> Iterator[st
             return
 
 
-def _of_support(name: str, place: Position, kind: Kind, on: list[tuple[str, Position, Kind]]) -> Iterator[str]:
+def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterator[str]:
     if not on:
         return
     for other, middle, one in on:

@@ -83,7 +83,7 @@ class Plan:
 
     Args:
         elements: name to element, in the order of laying.
-        instruction: the sentence that asks for it.
+        instruction: what the wall is, which heads its picture. A task asks for it in a sentence of its own.
         tolerance: how far the middle of an element may be off its place in x and in y, in metres.
         standard: where the tolerance comes from.
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.bounds import Among, Checked, Count, Seed
-from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task
+from lerobot_constructskill.contract import DEMO_SEED_START, FPS, get_task, label_of
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig, Sigma
@@ -61,7 +61,7 @@ def film(config: FilmConfig) -> str:
     """
     from lerobot_constructskill.lerobot_internals import write_video
 
-    out = config.out or Path("outputs") / f"{config.task}.mp4"
+    out = config.out or Path("outputs") / f"{label_of(config.task)}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())
     env = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed, film=True)
     frames = []

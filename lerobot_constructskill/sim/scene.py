@@ -415,7 +415,20 @@ class PickPlaceEnv(BaseEnv):
         return (x, y, z + RIM_ALLOWANCE)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
-        """Named booleans and `clipped_steps`, each (num_envs,); calling it twice in one step changes nothing."""
+        """Named booleans and counts, each (num_envs,); calling it twice in one step changes nothing."""
+        return self._conditions() | {
+            "placements": self._is_placed.sum(dim=1),
+            "chain": self._chain(),
+            "clipped_steps": self._clipping.steps.clone(),
+            **self._safety.info(),
+        }
+
+    def _chain(self) -> torch.Tensor:
+        """How many placements are done before the first that is not, (num_envs,)."""
+        return self._is_placed.long().cumprod(dim=1).sum(dim=1)
+
+    def _conditions(self) -> dict[str, torch.Tensor]:
+        """Named booleans, `success` among them, each (num_envs,); `_is_placed` keeps which placements are done."""
         center = self.object.pose.p
         offset = (center - self.bin.pose.p).abs()
         is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
@@ -428,17 +441,7 @@ class PickPlaceEnv(BaseEnv):
             "is_in_bin": is_in_bin,
             "is_gripper_open": is_gripper_open,
             "is_placed": is_placed,
-            **self._progress(),
             "success": is_placed.clone(),
-        }
-
-    def _progress(self) -> dict[str, torch.Tensor]:
-        """Placements that are done, how many before the first that is not, and what was clipped or went wrong."""
-        return {
-            "placements": self._is_placed.sum(dim=1),
-            "chain": self._is_placed.long().cumprod(dim=1).sum(dim=1),
-            "clipped_steps": self._clipping.steps.clone(),
-            **self._safety.info(),
         }
 
     def _lasts(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
@@ -490,7 +493,7 @@ class PickPlaceEnv(BaseEnv):
         """The state that experts read, as `contract.SIM_STATE` names it; each of shape (num_envs, n)."""
         joints, moving = self.agent.robot.get_qpos(), self.moving_placements()
         count, one = len(self.objects), torch.arange(self.num_envs, device=self.device)
-        following = self._is_placed.long().cumprod(dim=1).sum(dim=1).clamp(max=count - 1)
+        following = self._chain().clamp(max=count - 1)
         if self._lasting is None:
             lasting = self.lasting_placements()
             self._lasting = lasting, {name: _listed(value) for name, value in lasting.items()}

@@ -45,17 +45,16 @@ class StrictPlaceEnv(PickPlaceEnv):
         """Largest distance in x and y between the object's and the receptacle's middle, in metres."""
         return tuple((inside - size) / 2 for inside, size in zip(self.bin_interior, self.object_size, strict=True))[:2]
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def _conditions(self) -> dict[str, torch.Tensor]:
         rest, slack = (
             torch.tensor(value, device=self.device) for value in (self.rest_position, (*self.play, DEPTH_TOLERANCE))
         )
         speeds = self.object.linear_velocity.norm(dim=-1, keepdim=True)
         each = fits(self._object_poses(), rest, slack, self.yaw_tolerance, speeds)
-        info = super().evaluate() | {name: value[:, 0] for name, value in each.items()}
+        info = super()._conditions() | {name: value[:, 0] for name, value in each.items()}
         is_fit = torch.stack([info["is_gripper_open"], *(info[name] for name in each)]).all(dim=0)
         is_placed_strictly = self._has_lasted("is_placed_strictly", is_fit)
         self._is_placed[:] = is_placed_strictly[:, None]
-        info |= self._progress()
         return info | {"is_placed_strictly": is_placed_strictly, "success": is_placed_strictly.clone()}
 
 

@@ -20,6 +20,9 @@ from lerobot_constructskill.errors import MachineError
 
 SHADERS = Path(sapien.__file__).parent / "vulkan_shader"
 
+DIRECTED = sapien.render.RenderDirectionalLightComponent
+"""A light like the sun's."""
+
 CUTS = {
     "layout(location = 1) out ivec4 outPositionSegmentation;": "",
     "outPositionSegmentation = ivec4(ivec3(inPosition * 1000), inSegmentation[1]);": "",
@@ -143,9 +146,6 @@ def shining_sun(scene: ManiSkillScene) -> Iterator[None]:
         sub_scene.remove_entity(entity)
         for light, colour in zip(lights, colours, strict=True):
             light.color = colour
-
-
-DIRECTED = sapien.render.RenderDirectionalLightComponent
 
 
 def half_angle(cosine: float, side: float) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.plans.plan import KINDS, written
+from lerobot_constructskill.sim.contacts import FORCE_LIMIT
 
 pytestmark = pytest.mark.sim
 
@@ -103,6 +104,7 @@ def test_forces_and_what_is_unsafe_are_told_and_an_episode_begins_anew():
     left, right = state.finger_forces.reshape(2, 3)
     weight = 9.81 * state.object_mass[0]
     assert left[1] * right[1] < 0 and abs(left[1]) > 20, "the jaws press from both sides"
+    assert 0.4 * FORCE_LIMIT < state.object_forces[0] < 0.6 * FORCE_LIMIT, "the limit is twice a grasp's"
     assert -(left + right)[2] < weight * 3 and state.object_forces[0] == pytest.approx(np.linalg.norm(left), rel=0.2)
     assert (info["drops"], info["cost"]) == (0, 0) and info["peak_force"] >= state.object_forces[0]
     for _ in range(12):

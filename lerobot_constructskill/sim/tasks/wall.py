@@ -134,19 +134,20 @@ class WallEnv(PickPlaceEnv):
 
     # Success
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def _conditions(self) -> dict[str, torch.Tensor]:
         poses = self._object_poses()
+        rest, was_placed = self._rest_positions(poses), self._is_placed
         speeds = torch.stack([one.linear_velocity.norm(dim=-1) for one in self.objects], dim=1)
         slack = torch.tensor([self.plan.tolerance, self.plan.tolerance, DEPTH_TOLERANCE], device=self.device)
-        each = fits(poses, self._rest_positions(poses), slack, self.yaw_tolerance, speeds)
+        each = fits(poses, rest, slack, self.yaw_tolerance, speeds)
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
         lies = torch.stack([*each.values()]).all(dim=0)
         was_let_go = self._lasts("lies", lies & is_gripper_open[:, None])
         # What is laid on an element presses and shakes it.
         stays = torch.stack([value for name, value in each.items() if name != "is_at_rest"]).all(dim=0)
-        self._safety.knock(self._is_placed & ~stays)
-        self._is_placed = stays & (self._is_placed | was_let_go)
-        self._targets = self._rest_positions(poses)
+        self._safety.knock(was_placed & ~stays)
+        self._is_placed = stays & (was_placed | was_let_go)
+        self._targets = rest if torch.equal(was_placed, self._is_placed) else self._rest_positions(poses)
         self._lifted |= (poses[..., 2] >= LIFT_HEIGHT).any(dim=1)
         is_placed = self._is_placed.all(dim=1)
         return {
@@ -155,7 +156,6 @@ class WallEnv(PickPlaceEnv):
             "is_gripper_open": is_gripper_open,
             "is_placed": is_placed,
             **{name: value.all(dim=1) for name, value in each.items()},
-            **self._progress(),
             "success": is_placed.clone(),
         }
 
