@@ -1,1 +1,1 @@
-"""Walls as lists of placements: read, checked, drawn, and made from IFC files."""
+"""Walls as lists of placements: read, checked, drawn, measured, made of IFC files. Without simulator and LeRobot."""

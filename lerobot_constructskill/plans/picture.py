@@ -35,9 +35,9 @@ def draw_plan(plan: Plan, title: str, path: Path) -> None:
     for number, (start, kind) in enumerate(zip(supplies(plan), plan.kinds, strict=True)):
         above.add_patch(_outline((*start, 0.0), kind, 0, 1, **WAITING))
         above.annotate(f"{number + 1}", start, ha="center", va="center", fontsize=7, color="#888888")
-    above.set(
-        xlabel="x (m)", ylabel="y (m)", title=f"{title}: {plan.instruction} Tolerance {1000 * plan.tolerance:g} mm."
-    )
+    above.set(xlabel="x (m)", ylabel="y (m)")
+    tolerance = f"tolerance {1000 * plan.tolerance:g} mm" + f" ({plan.standard})" * bool(plan.standard)
+    above.set_title(f"{title}: {plan.instruction}\n{tolerance}", fontsize=10)
     side.set(xlabel="x (m)", ylabel="z (m)")
     side.axhline(0, color="black", linewidth=0.8)
     above.set(xlim=(-1.1, 0.3), ylim=(-0.65, 0.7), aspect="equal")
