@@ -13,6 +13,7 @@ from typing import Any
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.other_tasks import offered
+from lerobot_constructskill.wordings import REWORDINGS
 
 FPS = 20
 """Control rate in Hz: ManiSkill's default, and the frame rate of every data set."""
@@ -186,10 +187,14 @@ LADDER_YIELDS = {"brick_to_bin_5mm": 0.3, "brick_to_bin_3mm": 0.1}
 """`noisy_yield` of the tightest bins, where noise turns the brick between the fingers: 24 of 40 attempts succeeded at
 5 mm and 15 of 40 at 3 mm."""
 
+ORDERS = {f"{item}_to_{colour}": (item, colour) for item in ("brick", "block") for colour in ("grey", "blue")}
+"""Tasks that only the instruction tells apart: name to the object and the bin that it asks for."""
+
 SUITES = {
     "bins": ("brick_to_bin", "brick_to_bin_shifted", "block_to_bin"),
     "ladder": tuple(LADDER),
     "joints": ("brick_on_brick", "tile_to_grid", "tenon_to_mortise"),
+    "orders": tuple(ORDERS),
     "wall": ("course_of_three", "bond_of_five", "lintel_on_posts"),
 }
 """Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
@@ -223,6 +228,8 @@ class Task:
             and a data set of a task below 0.5 needs a larger `max_failures`.
         is_brick: the object is a brick, whose size can be perturbed.
         plan: the plan after which several objects are placed, a name in `configs/plan`; none where there is one.
+        rewordings: other sentences that mean the same: those to train with, then those that are never trained with, by
+            level of the axis `language`.
     """
 
     name: str
@@ -235,6 +242,7 @@ class Task:
     noisy_yield: float = 0.9
     is_brick: bool = False
     plan: str | None = None
+    rewordings: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self):
         wrong = {
@@ -259,7 +267,7 @@ BRICK = (0.21, 0.065, 0.10)
 """Size of the paper's brick as it stands, in metres: Waaldickformat, on its long narrow face."""
 
 SHIPPED = {
-    task.name: task
+    task.name: replace(task, rewordings=REWORDINGS[task.instruction])
     for task in (
         Task(
             name="brick_to_bin",
@@ -338,6 +346,17 @@ SHIPPED = {
         *(
             Task(
                 name=name,
+                env_id=f"ConstructionOrder{item.title()}{colour.title()}-v1",
+                instruction=f"Put the {item} into the {colour} bin.",
+                horizon=300,
+                scene=f"{_SCENES}.order:OrderEnv",
+                expert=_PICK_PLACE,
+            )
+            for name, (item, colour) in ORDERS.items()
+        ),
+        *(
+            Task(
+                name=name,
                 env_id=f"Construction{''.join(part.title() for part in name.split('_'))}-v1",
                 instruction=instruction,
                 horizon=horizon,
@@ -359,7 +378,8 @@ SHIPPED = {
 PLAN_TASK = replace(
     SHIPPED["course_of_three"],
     env_id="ConstructionPlan-v1",
-    instruction="Build the wall after its plan.",
+    instruction=(_BUILD := "Build the wall after its plan."),
+    rewordings=REWORDINGS[_BUILD],
     horizon=400 * MAX_PLACEMENTS,
 )
 """The row of any other plan, which is named by the task: `plan:NAME_OR_FILE`."""

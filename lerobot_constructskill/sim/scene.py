@@ -17,7 +17,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SimConfig
 from torch.nn.functional import pad
 from transforms3d.euler import euler2quat
@@ -298,12 +298,16 @@ class PickPlaceEnv(BaseEnv):
 
         By default a floor and four walls around `bin_interior`.
         """
+        self._add_bin(builder, (0.10, 0.22, 0.42))
+
+    def _add_bin(self, builder: ActorBuilder, colour: tuple[float, float, float]) -> None:
+        """Add a floor and four walls around `bin_interior` to an actor, in a colour as RGB from 0 to 1."""
         x, y, z = self.bin_interior
         panels = [([0, 0, -(z + WALL) / 2], [x + 2 * WALL, y + 2 * WALL, WALL])]
         panels += [([side * (x + WALL) / 2, 0, 0], [WALL, y + 2 * WALL, z]) for side in (-1, 1)]
         panels += [([0, side * (y + WALL) / 2, 0], [x, WALL, z]) for side in (-1, 1)]
         for center, size in panels:
-            self._add_box(builder, center, size, (0.10, 0.22, 0.42))
+            self._add_box(builder, center, size, colour)
 
     def _add_box(
         self,
@@ -429,11 +433,9 @@ class PickPlaceEnv(BaseEnv):
 
     def _conditions(self) -> dict[str, torch.Tensor]:
         """Named booleans, `success` among them, each (num_envs,); `_is_placed` keeps which placements are done."""
-        center = self.object.pose.p
-        offset = (center - self.bin.pose.p).abs()
-        is_in_bin = (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
+        is_in_bin = self._is_in(self.object, self.bin)
         is_gripper_open = (self.agent.robot.get_qpos()[:, -2:] >= FINGER_OPEN).all(dim=-1)
-        self._lifted |= center[:, 2] >= LIFT_HEIGHT
+        self._lifted |= self.object.pose.p[:, 2] >= LIFT_HEIGHT
         is_placed = self._has_lasted("is_placed", is_in_bin & is_gripper_open)
         self._is_placed[:] = is_placed[:, None]
         return {
@@ -443,6 +445,11 @@ class PickPlaceEnv(BaseEnv):
             "is_placed": is_placed,
             "success": is_placed.clone(),
         }
+
+    def _is_in(self, one: Actor, receptacle: Actor) -> torch.Tensor:
+        """Whether the centre of an object is inside `placement_bounds` of a receptacle's, (num_envs,)."""
+        offset = (one.pose.p - receptacle.pose.p).abs()
+        return (offset <= torch.tensor(self.placement_bounds, device=self.device)).all(dim=-1)
 
     def _lasts(self, name: str, is_met: torch.Tensor) -> torch.Tensor:
         """Whether a condition was met in `PLACED_STEPS` consecutive steps until now, booleans of its shape.

@@ -10,6 +10,9 @@ from lerobot_constructskill.sim.visuals import mottled
 AERATED_CONCRETE_DENSITY = 600.0
 """kg/m3, autoclaved aerated concrete."""
 
+BLOCK = (0.12, 0.06, 0.08)
+"""Size of the block in metres."""
+
 
 @register_env(TASKS["block_to_bin"].env_id, max_episode_steps=TASKS["block_to_bin"].horizon)
 class BlockToBinEnv(PickPlaceEnv):
@@ -24,7 +27,7 @@ class BlockToBinEnv(PickPlaceEnv):
     - Those of `PickPlaceEnv`.
     """
 
-    object_size = (0.12, 0.06, 0.08)
+    object_size = BLOCK
     object_center = (0.02, 0.0)
     bin_center = (-0.05, 0.35)
     bin_interior = (0.30, 0.22, 0.12)
