@@ -17,7 +17,7 @@ class Analysis:
     """Labels, order and tests of a report.
 
     Args:
-        labels: name of a setting, variant, reference or sweep to its name in tables; the name itself by default.
+        labels: name of a setting, variant, reference, sweep or mean to its name in tables; the name itself by default.
         order: variants that come first, in this order; the others follow in the order of the study.
         comparisons: pairs of variants to test, the family that Holm's correction covers; by default every pair with
             equally many planned seeds.
@@ -25,9 +25,11 @@ class Analysis:
         sweeps: name of what is varied to the settings that differ in it, the one without the variation first. They
             share a table and a figure, and have a section each only if they compare variants. Variants with the same
             label are one line.
+        means: name of some tasks to the settings that evaluate on them: a section each, on the mean over tasks of
+            every seed that ran in all of them.
 
     Raises:
-        InputError: a comparison is no pair or declared twice, or a sweep has fewer than two settings.
+        InputError: a comparison is no pair or declared twice, or a sweep or mean has fewer than two settings.
     """
 
     labels: dict[str, Text] = field(default_factory=dict)
@@ -35,6 +37,7 @@ class Analysis:
     comparisons: list[list[str]] | None = None
     alpha: Level = 0.05
     sweeps: dict[str, list[str]] = field(default_factory=dict)
+    means: dict[str, list[str]] = field(default_factory=dict)
 
     def __post_init__(self):
         check(self, "analysis.")
@@ -43,9 +46,9 @@ class Analysis:
                 raise InputError(f"A comparison must be a pair of variants, not {pair}.")
         if len({frozenset(pair) for pair in self.comparisons or []}) < len(self.comparisons or []):
             raise InputError("Each comparison is declared once: twice it would count twice in Holm's correction.")
-        for name, settings in self.sweeps.items():
+        for name, settings in [*self.sweeps.items(), *self.means.items()]:
             if len(settings) < 2 or len(set(settings)) < len(settings):
-                raise InputError(f"A sweep must be two settings or more, each once; '{name}' is {settings}.")
+                raise InputError(f"A sweep or mean must be two settings or more, each once; '{name}' is {settings}.")
 
     def check(self, variants: Collection[str], settings: Collection[str], references: Collection[str] = ()) -> None:
         """Check that the study has every name.
@@ -55,12 +58,14 @@ class Analysis:
         """
         _check_known("variant in comparisons", chain.from_iterable(self.comparisons or []), variants)
         _check_known("variant in order", self.order, variants)
-        _check_known("name in labels", self.labels, [*variants, *settings, *references, *self.sweeps])
+        _check_known("name in labels", self.labels, [*variants, *settings, *references, *self.sweeps, *self.means])
         _check_known("setting in sweeps", chain.from_iterable(self.sweeps.values()), settings)
+        _check_known("setting in means", chain.from_iterable(self.means.values()), settings)
         varied = {name for swept in self.sweeps.values() for name in swept[1:]}
-        for name, swept in self.sweeps.items():
+        for name in (*self.sweeps, *self.means):
             if name in (*variants, *settings, *references):
-                raise InputError(f"The sweep '{name}' needs a name that nothing else in the study has.")
+                raise InputError(f"The sweep or mean '{name}' needs a name that nothing else in the study has.")
+        for name, swept in self.sweeps.items():
             if swept[0] in varied:
                 raise InputError(f"'{swept[0]}' begins the sweep '{name}' and must not be varied in another.")
 

@@ -10,6 +10,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
+import pandas as pd
 import pytest
 from synthetic_study import (
     HOSTILE,
@@ -287,7 +289,7 @@ def test_declared_comparisons_are_the_family(tmp_path):
 @pytest.mark.parametrize(
     ("sweeps", "said"),
     [
-        ({"clip": ["fixed", "moved"]}, "The sweep 'clip' needs a name that nothing else in the study has."),
+        ({"clip": ["fixed", "moved"]}, "The sweep or mean 'clip' needs a name that nothing else in the study has."),
         ({"a": ["fixed", "moved"], "b": ["moved", "fixed"]}, "'fixed' begins the sweep 'a' and must not be varied"),
     ],
 )
@@ -321,6 +323,21 @@ def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_n
     assert ("#moved" in page.links) == ("moved" in sections)
 
 
+def test_a_mean_over_tasks_is_of_seeds_that_ran_in_all_and_pools_no_episodes(tmp_path, no_figures):
+    rows = [row for row in study_rows() if (row.setting, row.variant, row.training_seed) != ("moved", "clip", 4)]
+    (mean,) = findings_of(STUDY, rows, tmp_path, means={"both": ["fixed", "moved"]}).means
+    found = {one.name: one for one in mean.variants}
+    shares = {
+        setting: pd.Series([row.placed for row in own]).mean()
+        for setting in ("fixed", "moved")
+        if (own := [row for row in rows if (row.setting, row.variant) == (setting, "dinov2")])
+    }
+    assert found["dinov2"].success["placed"].mean.value == pytest.approx(np.mean([*shares.values()]))
+    assert [len(found[name].runs) for name in ("dinov2", "clip", "augreg")] == [10, 9, 0]
+    assert ("dinov2", "clip") in {(pair.a, pair.b) for pair in mean.comparisons["placed"]}
+    assert "## both" in (Path(report(ReportConfig(tmp_path))).parent / "report.md").read_text()
+
+
 def test_in_a_sweep_variants_with_the_same_label_are_one_line(tmp_path):
     study = STUDY | {
         "variants": {"clip": {"seeds": 10, "settings": ["fixed"]}, "dinov2": {"seeds": 10, "settings": ["moved"]}}
@@ -352,7 +369,7 @@ def test_in_a_sweep_variants_with_the_same_label_are_one_line(tmp_path):
         ({"comparisons": [["one"]]}, "A comparison must be a pair of variants"),
         ({"comparisons": [["one", "one"]]}, "A comparison must be a pair of variants"),
         ({"sweeps": {"axis": ["fixed", "moved"]}}, "Unknown setting in sweeps 'moved'; the study has: fixed."),
-        ({"sweeps": {"axis": ["fixed"]}}, "A sweep must be two settings or more, each once; 'axis' is ['fixed']."),
+        ({"sweeps": {"axis": ["fixed"]}}, "must be two settings or more, each once; 'axis' is ['fixed']"),
         ({"alpha": 1.0}, "analysis.alpha must be a finite number above 0 and at most 0.5, not 1.0"),
         ({"alpha": float("nan")}, "analysis.alpha must be a finite number above 0 and at most 0.5, not nan"),
         ({"alhpa": 0.1}, "alhpa"),

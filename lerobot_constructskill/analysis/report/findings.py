@@ -161,6 +161,7 @@ class Findings:
 
     Args:
         settings: findings of each setting.
+        means: settings that stand for the mean over several.
         sweeps: settings that differ in one thing.
         alpha: level of the tests.
         episodes: evaluation episodes of a run.
@@ -171,6 +172,7 @@ class Findings:
     """
 
     settings: list[SettingFindings]
+    means: list[SettingFindings]
     sweeps: list[Sweep]
     alpha: float
     episodes: int

@@ -49,6 +49,7 @@ def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws) -> Findings:
     }
     return Findings(
         settings=list(settings.values()),
+        means=[_mean(analysis, name, own, planned, runs) for name, own in analysis.means.items()],
         sweeps=[
             Sweep(analysis.label(name), [settings[one] for one in swept]) for name, swept in analysis.sweeps.items()
         ],
@@ -86,8 +87,24 @@ def check_rows(rows: pd.DataFrame) -> None:
         )
 
 
+def _mean(
+    analysis: Analysis, name: str, settings: list[str], planned: pd.DataFrame, runs: pd.DataFrame
+) -> SettingFindings:
+    """The mean over some settings: each seed's share is the mean of its shares, whatever number of episodes they have.
+
+    A seed that did not run in all of the settings is planned and not made.
+    """
+    own = runs[runs["setting"].isin(settings)].groupby(["variant", "training_seed"], as_index=False)
+    shares = [f"{criterion}_rate" for criterion in CRITERIA]
+    means = own.first().drop(columns=[*shares, "heldout_mse_m2", "heldout_mse_m2_by_data"])
+    means = means.merge(own[[*shares, "heldout_mse_m2"]].mean()).assign(setting=name, heldout_mse_m2_by_data=None)
+    whole = means[(own.size()["size"] == len(settings)).to_numpy()]
+    seeds = planned[planned["setting"].isin(settings)].drop_duplicates(["variant", "training_seed"])
+    return _setting(analysis, name, seeds.assign(setting=name), whole, None)
+
+
 def _setting(
-    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None
 ) -> SettingFindings:
     """One setting. Only the tables follow `analysis.order`, so that another order shows the same numbers."""
     of_variants = planned["role"] == VARIANT
@@ -118,10 +135,13 @@ def _setting(
 
 
 def _variants(
-    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None
 ) -> list[VariantFindings]:
+    def of(table: pd.DataFrame | None, name: str) -> pd.DataFrame | None:
+        return None if table is None else table[table["variant"] == name]
+
     return [
-        _variant(analysis.label(name), own, runs[runs["variant"] == name], episodes[episodes["variant"] == name])
+        _variant(analysis.label(name), own, of(runs, name), of(episodes, name))
         for name, own in planned.groupby("variant", sort=False)
     ]
 
