@@ -5,7 +5,7 @@
 set -euo pipefail
 cd "$(dirname "$0")"
 
-EXTRAS=${EXTRAS:-sim,offline,cpu,study,bim,distributed,policies,evaluators,docs,dev}
+EXTRAS=${EXTRAS:-sim,offline,cpu,study,bim,language,distributed,policies,evaluators,docs,dev}
 PACKAGES=(libvulkan1 libx11-6 ffmpeg mesa-vulkan-drivers "$@")
 MESA=24.3 # the first whose lavapipe has VK_KHR_external_semaphore_fd, without which SAPIEN finds no device
 # Weights without code; the package asks for a torch of 2020 all the same.

@@ -128,6 +128,7 @@ Episode = Annotated[int, Range(0, 10_000_000)]
 Episodes = Annotated[list[Episode], NotEmpty()]
 Text = Annotated[str, Pattern(rf"(?=.*\S)[^{UNSEEN}]+", "one line of text")]
 Word = Annotated[str, Pattern(_WORD, "a name of letters, digits, '_', '-' and '.'")]
+Cameras = Annotated[str, Pattern(rf"{_WORD}(\+{_WORD})*", "a camera's name, or several with '+' between")]
 RepoId = Annotated[str, Pattern(rf"{_WORD}/{_WORD}", "user/name, each of letters, digits, '_', '-' and '.'")]
 Device = Annotated[str, Present()]
 

@@ -1,5 +1,6 @@
 """A feature set of random numbers, written through LeRobot: seeds train on it without simulator or encoder."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,18 @@ def other_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> L
     return write_random_set(tmp_path_factory.mktemp("features") / "other", tiny_weights, seed=1)
 
 
-def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDataset:
-    """Eight episodes whose actions are a linear function of random features, with random points and patch features."""
+@pytest.fixture(scope="session")
+def told_set(tmp_path_factory: pytest.TempPathFactory, tiny_weights: Path) -> LeRobotDataset:
+    """Two tasks, each with one action, opposite to each other: only the sentence says which."""
+    tasks = "Put the brick into the grey bin.", "Put the brick into the blue bin."
+    return write_random_set(tmp_path_factory.mktemp("features") / "told", tiny_weights, seed=2, tasks=tasks)
+
+
+def write_random_set(root: Path, tiny_weights: Path, seed: int, tasks: Sequence[str] = ("a task",)) -> LeRobotDataset:
+    """Eight episodes whose actions are a linear function of random features, with random points and patch features.
+
+    Where there are two tasks, the action is that of the task.
+    """
     spec = BACKBONES[TINY]
     encoder = FrozenEncoder(spec)
     encoder.model.load_state_dict(load_file(tiny_weights))
@@ -57,10 +68,11 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
     dataset = LeRobotDataset.create("local/random", fps=20, root=root, features=features)
     rng = np.random.default_rng(seed)
     mixing = rng.normal(size=(dim, 4)) / np.sqrt(dim)
-    for _ in range(EPISODES):
+    for episode in range(EPISODES):
+        number = episode % len(tasks)
         for _ in range(LENGTH):
-            feature = rng.normal(size=dim)
-            action = 0.03 * np.tanh(feature @ mixing)
+            feature = rng.normal(size=dim) / len(tasks) ** 3
+            action = 0.03 * np.tanh(feature @ mixing) if len(tasks) == 1 else np.full(4, 0.03 * (-1) ** number)
             action[3] = np.sign(action[3])
             dataset.add_frame(
                 {
@@ -68,7 +80,7 @@ def write_random_set(root: Path, tiny_weights: Path, seed: int) -> LeRobotDatase
                     "observation.points.base": rng.uniform(-1, 1, len(POINT_NAMES)).astype(np.float32),
                     "observation.state": rng.normal(size=8).astype(np.float32),
                     "action": action.astype(np.float32),
-                    "task": "a task",
+                    "task": tasks[number],
                 }
             )
         dataset.save_episode()

@@ -84,7 +84,9 @@ def write_feature_set(
     patches: bool = False,
     points: bool = False,
 ) -> None:
-    """Write a copy of `dataset` with the pooled features of one camera, (N, D) float32, in place of its images.
+    """Write a copy of `dataset` with the pooled features of a camera, (N, D) float32, in place of its images.
+
+    Of several cameras, `base+wrist`, the pooled features and the patches stand one after the other.
 
     Indices, episodes, tasks, actions and other observations stay as they are; columns that no policy reads are left
     out, because LeRobot's loader takes time for each.
@@ -101,12 +103,17 @@ def write_feature_set(
     """
     batch_size = batch_size or BATCHES.get(encoder.device.type, BATCH)
     info = info | _source(dataset) | batch_facts(encoder.device, batch_size)
-    # All that decides the content is in the folder's name, so parts of other encoders are never taken.
-    parts = folder.with_name(PARTS) / digest({**info, "camera": camera, "patches": patches})
     poses = {name: _column(dataset, name) for name in POSES.values() if points and name in dataset.meta.features}
     found = {point_key(camera): find_points(poses, camera, encoder.crop)} if points else {}
-    columns = {feature_key(camera): _encode_frames(dataset, camera, encoder, batch_size, parts, patches), **found}
-    files = [_part(parts, episode).with_suffix(PATCHES) for episode in dataset.meta.episodes] if patches else []
+    # All that decides the content is in the folder's name, so parts of other encoders are never taken.
+    each = {
+        name: folder.with_name(PARTS) / digest({**info, "camera": name, "patches": patches})
+        for name in camera.split("+")
+    }
+    made = [_encode_frames(dataset, name, encoder, batch_size, parts, patches) for name, parts in each.items()]
+    columns = {feature_key(camera): np.concatenate(made, axis=1), **found}
+    episodes = dataset.meta.episodes if patches else []
+    files = [[_part(parts, episode).with_suffix(PATCHES) for parts in each.values()] for episode in episodes]
     _write_copy(dataset, camera, columns, files, info, repo_id, folder)
 
 
@@ -129,7 +136,7 @@ def join_feature_sets(
     columns = {name: np.concatenate([_column(part, name) for part in parts]) for name in names}
     if len(columns[feature_key(camera)]) != dataset.num_frames:
         raise InputError(f"The parts of '{dataset.repo_id}' do not add up to its {dataset.num_frames} frames.")
-    files = [part.root / PATCHES_FILE for part in parts] if patches else []
+    files = [[part.root / PATCHES_FILE] for part in parts] if patches else []
     _write_copy(dataset, camera, columns, files, info | _source(dataset), repo_id, folder)
 
 
@@ -137,14 +144,20 @@ def _column(dataset: LeRobotDataset, name: str) -> np.ndarray:
     return np.stack(dataset.hf_dataset.with_format("numpy")[name][:])
 
 
-def _join_files(files: Sequence[Path], frames: int, joined: Path) -> None:
-    """Write the rows of several files of patch features, one open at a time, into one of so many frames."""
-    shape = (frames, *np.load(files[0], mmap_mode="r").shape[1:])
+def _join_files(files: Sequence[Sequence[Path]], frames: int, joined: Path) -> None:
+    """Write the rows of files of patch features into one of so many frames.
+
+    Args:
+        files: those of each episode, or each part, of which one is open at a time; one a camera.
+    """
+    rows = (np.concatenate([np.load(file, mmap_mode="r") for file in own], axis=1) for own in files)
+    first = [np.load(file, mmap_mode="r").shape for file in files[0]]
+    shape = (frames, sum(patches for _, patches, _ in first), first[0][2])
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float16)), "fortran_order": False, "shape": shape}
     with joined.open("wb") as out:  # a full disk raises here; under a memory map it would kill the process
         np.lib.format.write_array_header_1_0(out, header)
-        for file in files:
-            out.write(np.load(file, mmap_mode="r"))
+        for some in rows:
+            out.write(some)
 
 
 def _source(dataset: LeRobotDataset) -> dict[str, str]:
@@ -189,7 +202,7 @@ def _write_copy(
     dataset: LeRobotDataset,
     camera: str,
     columns: dict[str, np.ndarray],
-    patches: Sequence[Path],
+    patches: Sequence[Sequence[Path]],
     info: dict[str, str],
     repo_id: str,
     folder: Path,

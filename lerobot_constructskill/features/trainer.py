@@ -13,6 +13,7 @@ from lerobot_constructskill.features.node import PACKAGES, Features, JoinedFeatu
 from lerobot_constructskill.policies.frozen_vit.backbones import get_backbone
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FrozenViTChunkConfig
 from lerobot_constructskill.policies.frozen_vit.feature_sets import close_patches
+from lerobot_constructskill.policies.frozen_vit.language import language_sha256
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, PRECISIONS, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import READOUTS
@@ -36,7 +37,7 @@ class FeatureTrainer(Trainer):
     packages = PACKAGES
 
     def settle(self, config: FrozenViTChunkConfig) -> list[FrozenViTChunkConfig]:
-        """Resolve the precision `auto`, here and on other machines, and the hash of the weights (None without any).
+        """Resolve the precision `auto`, here and on other machines, and the hashes of weights (None without any).
 
         Raises:
             InputError: its heads are to begin as those of a checkpoint, or no source has weights of the hash it names.
@@ -46,9 +47,11 @@ class FeatureTrainer(Trainer):
         here = resolve_precision(config.backbone_precision, config.device)
         spec = get_backbone(config.backbone, config.backbone_path)
         sha256 = find_sha256(spec, config.backbone_path, config.backbone_pretrained, config.backbone_sha256)
+        told = language_sha256(config.language, config.language_sha256)
+        config = replace(config, backbone_sha256=sha256, language_sha256=told, save_backbone=False)
         precisions = [here, *PRECISIONS] if config.backbone_precision == AUTO else [here]
         return [
-            replace(config, device=device, backbone_precision=one, backbone_sha256=sha256, save_backbone=False)
+            replace(config, device=device, backbone_precision=one)
             for device, one in dict.fromkeys(product([config.device, "cpu"], precisions))
         ]
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.bounds import BatchSize, Device, RepoId, Text, Word, check
+from lerobot_constructskill.bounds import BatchSize, Cameras, Device, RepoId, Text, check
 from lerobot_constructskill.scripts.console import command
 
 
@@ -25,7 +25,7 @@ class EncodeConfig:
     backbone: str = "dinov2_vits14"  # an entry of `backbones.BACKBONES`, timm/<model>, or hf/<owner>/<name>
     backbone_path: Text | None = None  # folder or file with the weights; else the [offline] packages, then the Hub
     backbone_precision: str = "auto"  # auto is the fastest that the device has natively; or float32, bfloat16
-    camera: Word = "base"  # observation.images.<camera>
+    camera: Cameras = "base"  # observation.images.<camera>; several as base+wrist
     crop: list[float] | None = None  # left, top, right, bottom in shares of the image, the same as the policy's
     patches: bool = False  # also write every patch's feature, `patch_features.npy`, (N, P, D) float16
     points: bool = False  # also write where in the image object, receptacle and hand are, for the readout heat_maps

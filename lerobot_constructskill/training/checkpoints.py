@@ -44,11 +44,12 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str, recorded: Sequence[str
     if reads_state and obs_type == "pixels":
         raise InputError("The policy reads observation.state; where it acts, obs_type has to be 'pixels_agent_pos'.")
     camera, shown = getattr(policy, "camera", None), OBS_TYPES[obs_type]  # others look at whatever they are shown
-    if camera not in (None, *shown):
+    cameras = {*camera.split("+")} if camera else set()
+    if not cameras <= {*shown}:
         raise InputError(
             f"The policy reads camera '{camera}'; where it acts, obs_type '{obs_type}' has {', '.join(shown)}."
         )
-    if recorded is not None and camera not in (None, *recorded):
+    if recorded is not None and not cameras <= {*recorded}:
         raise InputError(
             f"The policy reads camera '{camera}'; the demonstrations are recorded by {', '.join(recorded)}."
         )

@@ -43,7 +43,7 @@ def sides(config, tmp_path_factory) -> str:
     root = tmp_path_factory.mktemp("sides")
     images = {f"observation.images.{name}": IMAGE for name in ("base", "wrist")}
     act, ours = ACTConfig(device="cpu", input_features=images | {"observation.state": STATE}, **SMALL), config()
-    ours.input_features = {ours.image_key: IMAGE}
+    ours.input_features = {ours.image_keys[0]: IMAGE}
     for seed, filled in enumerate((act, ours)):
         write_checkpoint(filled, root / f"seed_{seed}", seed)
     return f"{root}/seed_*"

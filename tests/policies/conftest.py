@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
-from random_features import config, feature_set, other_set, tiny_weights  # noqa: F401
+from random_features import config, feature_set, other_set, tiny_weights, told_set  # noqa: F401
 from safetensors.torch import save_file
 from torch import Tensor
 

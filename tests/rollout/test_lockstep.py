@@ -31,7 +31,7 @@ NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | d
 def random_agent(config, seed, **fields):
     torch.manual_seed(seed)
     filled = config(**fields)
-    filled.input_features = {filled.image_key: IMAGE}
+    filled.input_features = {filled.image_keys[0]: IMAGE}
     policy = FrozenViTChunkPolicy(filled)
     return PolicyAgent(policy, *make_pre_post_processors(policy.config))
 

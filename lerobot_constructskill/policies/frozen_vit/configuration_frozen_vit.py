@@ -7,12 +7,13 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.optim import AdamWConfig
 from lerobot.utils import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_constructskill.bounds import Among, Pattern, Range, Text, Word, check
+from lerobot_constructskill.bounds import Among, Cameras, Pattern, Range, Text, check
 from lerobot_constructskill.errors import InputError, as_field_error
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
 from .backbones import IMAGE_SIZE, check_backbone
 from .feature_sets import feature_key, point_key
+from .language import check_language
 from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
 
@@ -20,6 +21,7 @@ TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
 GRIPPER_NAME = "gripper"
 GRIPPER_HEADS = ("bce", "regression")
+FUSIONS = ("concat", "film")
 REGRESSION_LOSSES = ("mse", "l1")
 
 LARGEST_EXPONENT = 80
@@ -55,7 +57,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             `backbone_precision`. A feature set and a checkpoint say their own. Where a policy acts on features of
             another one, the log says so, with the drift of the features.
         save_backbone: whether checkpoints hold the backbone; without it they are small and need a source of weights.
-        camera: the one camera used, `observation.images.<camera>` or encoded `observation.features.<camera>`.
+        camera: the camera that it looks at, `observation.images.<camera>` or encoded `observation.features.<camera>`;
+            or several, such as `base+wrist`: the heads see what the readout takes of each, one after the other.
         crop: left, top, right and bottom edge of the part of the image that is encoded, in shares of its width and
             height (0 to 1); None takes all of it, as the paper does. On a feature set it must be that of its encoding.
         blind: whether the encoder always sees a grey image, to measure what seeing gives.
@@ -71,6 +74,14 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             for the readout "cls".
         use_state: whether the heads also see `observation.state`, normalised by the statistics of the whole data set,
             episodes held out for evaluation included.
+        language: how the heads are told the instruction, the data set's `task`: by its vector of a frozen sentence
+            encoder, "minilm" (all-MiniLM-L6-v2, extra `language`) or `hf/<owner>/<name>[@<commit>]`; by the "number"
+            of a sentence that was trained on; or not at all (None).
+        language_sha256: hash that the sentence encoder's weights must have; None takes those that are found. A
+            checkpoint records it in `encoder.json`.
+        language_fusion: where the instruction enters: "concat" beside what the readout found and the state, or "film",
+            which scales and shifts what the readout found (Perez et al. 2018).
+        sentences: the instructions that it is trained on, written from the data set.
         head_hidden_dim: width of the hidden layers (GELU) in each of the two heads; None makes them linear, as the
             paper does.
         head_hidden_layers: how many hidden layers each head has, where it has any.
@@ -118,12 +129,16 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     backbone_precision: Annotated[str, Among((AUTO, *PRECISIONS))] = AUTO
     backbone_trained_precision: Annotated[str, Among(PRECISIONS)] | None = None
     save_backbone: bool = True
-    camera: Word = "base"
+    camera: Cameras = "base"
     crop: list[Annotated[float, Range(0, 1)]] | None = None
     blind: bool = False
     readout: Annotated[str, Among(tuple(READOUTS))] = "cls"
     standardize_features: bool = False
     use_state: bool = False
+    language: Text | None = None
+    language_sha256: Annotated[str, Pattern("[0-9a-f]{64}", "64 hexadecimal digits")] | None = None
+    language_fusion: Annotated[str, Among(FUSIONS)] = "concat"
+    sentences: list[str] | None = None
     head_hidden_dim: Annotated[int, Range(1, 65_536)] | None = None
     head_hidden_layers: Annotated[int, Range(1, 16)] = 1
 
@@ -151,6 +166,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     def _check(self) -> None:
         check(self)
         check_backbone(self.backbone)
+        if self.language is not None:
+            check_language(self.language)
         _check_action_names(self.action_names)
         identity = {"VISUAL": NormalizationMode.IDENTITY, "ACTION": NormalizationMode.IDENTITY}
         coeff = self.temporal_ensemble_coeff
@@ -164,6 +181,18 @@ class FrozenViTChunkConfig(PreTrainedConfig):
                 self.standardize_features and self.readout != "cls",
                 f"standardize_features works with readout=cls only, not {self.readout}: the statistics of a feature "
                 "set are those of its pooled feature.",
+            ),
+            (
+                bool(READOUTS[self.readout].points) and len(self.cameras) > 1,
+                f"readout={self.readout} finds points in the picture of one camera, not of {self.camera}.",
+            ),
+            (
+                len({*self.cameras}) < len(self.cameras),
+                f"camera names one twice: {self.camera}.",
+            ),
+            (
+                self.language is None and self.language_fusion != "concat",
+                "language_fusion says how the instruction enters, and language is null: name a sentence encoder.",
             ),
             (
                 self.point_weight != 1 and not READOUTS[self.readout].points,
@@ -194,8 +223,13 @@ class FrozenViTChunkConfig(PreTrainedConfig):
                 raise InputError(reason)
 
     @property
-    def image_key(self) -> str:
-        return f"{OBS_IMAGES}.{self.camera}"
+    def cameras(self) -> list[str]:
+        """The cameras, in the order in which the heads see them."""
+        return self.camera.split("+")
+
+    @property
+    def image_keys(self) -> list[str]:
+        return [f"{OBS_IMAGES}.{name}" for name in self.cameras]
 
     @property
     def feature_key(self) -> str:
@@ -220,18 +254,18 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         self.feature_column = features.get(self.feature_key)
 
     def validate_features(self) -> None:
-        """Narrow inputs to the one camera (and state) and outputs to `action`.
+        """Narrow inputs to the cameras (and state) and outputs to `action`.
 
-        A feature set has no images, but its policy will act on images: the camera is declared all the same.
+        A feature set has no images, but its policy will act on images: they are declared all the same.
 
         Raises:
-            ValueError: neither the camera nor its features are among the inputs, the state is asked for
+            ValueError: neither its cameras nor their features are among the inputs, the state is asked for
                 and absent, or `action` has another number of channels than `action_names`.
         """
         inputs, outputs = self.input_features or {}, self.output_features or {}
-        if self.image_key not in inputs and self.feature_key not in inputs:
+        if not {*self.image_keys} <= {*inputs} and self.feature_key not in inputs:
             raise InputError(
-                f"frozen_vit needs {self.image_key} or {self.feature_key}; the inputs are: "
+                f"frozen_vit needs {' and '.join(self.image_keys)} or {self.feature_key}; the inputs are: "
                 f"{', '.join(inputs) or 'none'} (choose another camera)."
             )
         if self.use_state and OBS_STATE not in inputs:
@@ -239,8 +273,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
         shape = outputs[ACTION].shape if ACTION in outputs else (len(self.action_names),)
         if tuple(shape) != (len(self.action_names),):
             raise InputError(f"The actions have shape {tuple(shape)}, but action_names are {self.action_names}.")
-        camera = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
-        self.input_features = {self.image_key: inputs.get(self.image_key, camera)}
+        picture = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
+        self.input_features = {key: inputs.get(key, picture) for key in self.image_keys}
         if self.use_state:
             self.input_features[OBS_STATE] = inputs[OBS_STATE]
         self.output_features = {ACTION: PolicyFeature(FeatureType.ACTION, tuple(shape))}

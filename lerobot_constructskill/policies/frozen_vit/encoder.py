@@ -31,12 +31,16 @@ class EncoderRecord:
         sha256: hash of these weights. It is checked whenever the checkpoint is loaded.
         precision: number format of the features that the heads learned from.
         runtime: what computed these features, OpenVINO (on a CPU) or PyTorch; None where a feature set does not say.
+        sentence_sha256: hash of the weights of the sentence encoder that the instructions went through; None without.
+        sentence_dim: length of an instruction's vector; None where the policy is told none.
     """
 
     source: str | None = None
     sha256: str | None = None
     precision: Literal["float32", "bfloat16"] | None = None
     runtime: Literal["openvino", "torch"] | None = None
+    sentence_sha256: str | None = None
+    sentence_dim: int | None = None
 
 
 RECORD_FILE = "encoder.json"
@@ -76,7 +80,7 @@ class FrozenEncoder(nn.Module):
         return self.mean.device
 
     @property
-    def runtime(self) -> str:
+    def runtime(self) -> Literal["openvino", "torch"]:
         """What computes the features on this machine."""
         on_cpu = self.device.type == "cpu" and openvino.is_installed() and is_native(self.precision, self.device)
         return "openvino" if on_cpu else "torch"

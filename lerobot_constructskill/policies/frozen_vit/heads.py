@@ -8,7 +8,7 @@ from lerobot.utils import OBS_STATE
 from torch import Tensor, nn
 
 from .configuration_frozen_vit import FrozenViTChunkConfig
-from .readouts import READOUTS
+from .readouts import READOUTS, in_each
 
 COSTS = {"mse": Tensor.square, "l1": Tensor.abs}
 """Cost of a translation's error: the paper's squared error, or the absolute one of ACT (Zhao et al. 2023)."""
@@ -20,31 +20,54 @@ class ChunkHeads(nn.Module):
     Args:
         config: says the readout, the state, the shape of a chunk of T steps and A channels, and the layers.
         feature_dim: length of the encoder's features.
+        sentence_dim: length of an instruction's vector, 0 where the heads are told none.
     """
 
-    def __init__(self, config: FrozenViTChunkConfig, feature_dim: int):
+    def __init__(self, config: FrozenViTChunkConfig, feature_dim: int, sentence_dim: int = 0):
         super().__init__()
         spec = READOUTS[config.readout]
         self.chunk_shape = (config.chunk_size, len(config.action_names) - 1)
         self.action_scale = config.action_scale
-        self.readout = spec.build(feature_dim) if spec.build else nn.Identity()
-        input_dim = spec.dim(feature_dim) + (config.input_features[OBS_STATE].shape[0] if config.use_state else 0)
+        self.readout = in_each(len(config.cameras), spec, feature_dim)
+        read_dim = len(config.cameras) * spec.dim(feature_dim)
+        self.side_dims = (config.input_features[OBS_STATE].shape[0] if config.use_state else 0), sentence_dim
+        self.film = _no_change(sentence_dim, read_dim) if config.language_fusion == "film" else None
+        input_dim = read_dim + self.side_dims[0] + (0 if self.film else sentence_dim)
         hidden = [config.head_hidden_dim] * config.head_hidden_layers if config.head_hidden_dim else []
         self.translation = _head(input_dim, hidden, self.chunk_shape[0] * self.chunk_shape[1])
         self.gripper = _head(input_dim, hidden, self.chunk_shape[0])
 
-    def forward(self, pooled: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def forward(self, pooled: Tensor, side: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return a chunk and the readout's vector, for pooled tokens (B, ...).
+
+        Args:
+            pooled: what the readout takes of the encoder's tokens.
+            side: the state and the instruction's vector, one after the other, (B, S); None where there is neither.
 
         Returns:
             (B, T, A), bounded translations in metres (and rotations in radians), then the gripper's logit or number;
             and the readout's vector.
         """
         read = self.readout(pooled)
-        inputs = read if state is None else torch.cat([read, state], dim=-1)
+        inputs = read if side is None else self._beside(read, side)
         regressed = self.translation(inputs).unflatten(-1, self.chunk_shape)
         chunk = torch.cat([self.action_scale * regressed.tanh(), self.gripper(inputs)[..., None]], dim=-1)
         return chunk, read
+
+    def _beside(self, read: Tensor, side: Tensor) -> Tensor:
+        state, sentence = side.split(self.side_dims, dim=-1)
+        if self.film is None:
+            return torch.cat([read, side], dim=-1)
+        scale, shift = self.film(sentence).chunk(2, dim=-1)
+        return torch.cat([read * (1 + scale) + shift, state], dim=-1)
+
+
+def _no_change(sentence_dim: int, read_dim: int) -> nn.Linear:
+    """From an instruction to scales and shifts of what the readout found, which begin as none."""
+    film = nn.Linear(sentence_dim, 2 * read_dim)
+    nn.init.zeros_(film.weight)
+    nn.init.zeros_(film.bias)
+    return film
 
 
 def _head(input_dim: int, hidden: list[int], output_dim: int) -> nn.Module:

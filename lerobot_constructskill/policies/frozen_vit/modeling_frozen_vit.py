@@ -25,6 +25,7 @@ from .configuration_frozen_vit import FrozenViTChunkConfig
 from .encoder import RECORD, RECORD_FILE, EncoderRecord, FrozenEncoder
 from .feature_sets import check_features, describe, open_patches, stated
 from .heads import ChunkHeads, heads_loss
+from .language import Told, sentences_of
 from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
 from .readouts import READOUTS
 from .shared_encoder import POOLED, SharedEncoders
@@ -33,7 +34,7 @@ from .weights import load_weights, read_tensors, state_sha256
 BACKBONE_PREFIX = "backbone."
 SAVED = Json("a policy's configuration")
 
-DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "gripper_head", "action_scale")
+DECISIVE = ("backbone", "readout", "standardize_features", "crop", "blind", "language", "gripper_head", "action_scale")
 """Fields that change the meaning of the heads' inputs or outputs, and no shape."""
 
 SILENT = 1e-3
@@ -43,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 
 class FrozenViTChunkPolicy(PreTrainedPolicy):
-    """Predicts a chunk of translations and gripper states from one camera image.
+    """Predicts a chunk of translations and gripper states from the picture of a camera, or of several.
 
     Args:
         config: the configuration; the precision that `auto` stands for is written into it.
@@ -85,10 +86,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if encoder_record is None:
             check_native(config.backbone_precision, config.device)
             self._load_backbone()
+        self.told = self._begin_told(dataset_meta)
         self.heads = self.fresh_heads()
 
-        self.register_buffer("feature_mean", torch.zeros(spec.feature_dim))
-        self.register_buffer("feature_std", torch.ones(spec.feature_dim))
+        self.register_buffer("feature_mean", torch.zeros(self.feature_dim))
+        self.register_buffer("feature_std", torch.ones(self.feature_dim))
         if encoder_record is None and config.standardize_features:
             self._take_statistics(dataset_stats or {})
 
@@ -97,9 +99,14 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._has_seen = False
         self.reset()
 
+    @property
+    def feature_dim(self) -> int:
+        """Length of the pooled features of all cameras."""
+        return len(self.config.cameras) * self.backbone.spec.feature_dim
+
     def fresh_heads(self) -> ChunkHeads:
         """Return heads with newly drawn weights."""
-        return ChunkHeads(self.config, self.backbone.spec.feature_dim)
+        return ChunkHeads(self.config, self.backbone.spec.feature_dim, self.told.dim if self.told else 0)
 
     def get_optim_params(self) -> list[nn.Parameter]:
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
@@ -126,8 +133,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
     def train(self, mode: bool = True) -> "FrozenViTChunkPolicy":
         """Switch the heads' mode, and record what computes the features that they learn from."""
         if mode and self.config.feature_column is None:  # the heads learn from this encoder's own features
-            own = {"precision": self.backbone.precision, "runtime": self.backbone.runtime}
-            self.encoder_record = replace(self.encoder_record, **own)
+            own = self.backbone
+            self.encoder_record = replace(self.encoder_record, precision=own.precision, runtime=own.runtime)
         return super().train(mode)
 
     @torch.no_grad()
@@ -208,10 +215,25 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         record, encoder, column = self.encoder_record, self.backbone, self.config.feature_column
         if column is not None:
             made_by = describe(encoder.spec, record.sha256, record.precision, encoder.crop, encoder.blind)
-            check_features(column, made_by, encoder.spec.feature_dim)
+            check_features(column, made_by, self.feature_dim)
             if self.readout.reads_patches:
                 open_patches(root)
             read_whole_batches()
+
+    def _begin_told(self, meta: Any) -> Told | None:
+        """What tells the heads their instruction; a checkpoint's record says how long its vector is."""
+        config, record = self.config, self.encoder_record
+        if config.language is None:
+            return None
+        if config.sentences is None:
+            if meta is None:
+                raise InputError(f"language={config.language} needs a data set, whose tasks it is told.")
+            config.sentences = sentences_of(meta)
+        told = Told(
+            config.language, config.sentences, record.sentence_dim, record.sentence_sha256 or config.language_sha256
+        )
+        self.encoder_record = replace(record, sentence_sha256=told.sha256, sentence_dim=told.dim)
+        return told
 
     def _check_data_set(self, meta: Any) -> None:
         """Refuse a data set of another rate, or without the points that the readout learns to find."""
@@ -283,7 +305,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         self._check_features(meta.root)
 
     def pool(self, images: Tensor) -> Tensor:
-        """Return what the readout takes of the encoder's tokens for images (B, 3, H, W) in [0, 1].
+        """Return what the readout takes of the encoder's tokens for one camera's images (B, 3, H, W) in [0, 1].
 
         Raises:
             ValueError: a checkpoint's precision, which this device would have to emulate.
@@ -295,20 +317,27 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         return self.readout.pool(*self.backbone.encode(images))
 
     def head_inputs(self, batch: dict[str, Tensor]) -> tuple[Tensor, ...]:
-        """Return the arguments of the heads: the pooled tokens, standardised if so configured, and any state."""
-        pooled = self._pooled(batch)
-        if self.config.standardize_features:
-            pooled = (pooled - self.feature_mean) / self.feature_std
-        if not self.config.use_state:
-            return (pooled,)
-        if OBS_STATE not in batch:
-            raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
-        return pooled, batch[OBS_STATE]
+        """Return the arguments of the heads: the pooled tokens, and any state and instruction in one vector."""
+        pooled, beside = self.pooled(batch), []
+        if self.config.use_state:
+            if OBS_STATE not in batch:
+                raise InputError(f"frozen_vit was trained with {OBS_STATE}, which obs_type=pixels_agent_pos shows.")
+            beside.append(batch[OBS_STATE])
+        if self.told:
+            if "task" not in batch:
+                raise InputError("frozen_vit was trained with instructions, and the batch has no task.")
+            beside.append(self.told(batch["task"]))
+        return (pooled, torch.cat(beside, dim=-1)) if beside else (pooled,)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:
         inputs = self.head_inputs(batch)
         with one_thread():
             return self.heads(*inputs)[0]
+
+    def pooled(self, batch: dict[str, Tensor]) -> Tensor:
+        """Return what the readout takes of the tokens of all cameras, (B, ...), standardised if so configured."""
+        pooled = self._pooled(batch)
+        return (pooled - self.feature_mean) / self.feature_std if self.config.standardize_features else pooled
 
     def _pooled(self, batch: dict[str, Tensor]) -> Tensor:
         if POOLED in batch:
@@ -318,12 +347,16 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             if not self.readout.reads_patches:
                 return cls
             rows = batch["index"].cpu()
-            patches = open_patches(self.patches_root).index_select(0, rows).to(cls.device)  # (B, N, D) float16
-            return self.readout.pool(cls, patches if self.readout.learns else patches.to(cls))
-        if self.config.image_key in batch:
-            return self.pool(batch[self.config.image_key])
+            patches = open_patches(self.patches_root).index_select(0, rows).to(cls.device)  # (B, C N, D) float16
+            patches = patches if self.readout.learns else patches.to(cls)
+            cameras = len(self.config.cameras)
+            each = zip(cls.chunk(cameras, dim=1), patches.chunk(cameras, dim=1), strict=True)
+            return torch.cat([self.readout.pool(*own) for own in each], dim=1)
+        keys = self.config.image_keys
+        if all(key in batch for key in keys):
+            return torch.cat([self.pool(batch[key]) for key in keys], dim=1)
         raise InputError(
-            f"frozen_vit needs {self.config.image_key} or {self.config.feature_key}; the batch holds: "
+            f"frozen_vit needs {' and '.join(keys)} or {self.config.feature_key}; the batch holds: "
             f"{', '.join(batch)}. obs_type=pixels_agent_pos shows the wrist camera and the state as well."
         )
 

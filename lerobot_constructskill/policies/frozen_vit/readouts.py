@@ -150,6 +150,23 @@ def _in_cache(patches: Tensor, like: Tensor) -> Iterator[Tensor]:
         yield cached[: len(some)].copy_(some)
 
 
+class InEach(nn.Module):
+    """A readout of several cameras: a module for each, and their vectors one after the other.
+
+    Args:
+        modules: one a camera.
+    """
+
+    def __init__(self, modules: Sequence[nn.Module]):
+        super().__init__()
+        self.cameras = nn.ModuleList(modules)
+
+    def forward(self, patches: Tensor) -> Tensor:
+        """Return (B, C V) for the patches of C cameras, (B, C N, D)."""
+        parts = zip(self.cameras, patches.chunk(len(self.cameras), dim=1), strict=True)
+        return torch.cat([module(own) for module, own in parts], dim=-1)
+
+
 class HeatMaps(nn.Module):
     """Where in the image some things are: the expected position under a heat map of each.
 
@@ -221,3 +238,10 @@ READOUTS = {
     "attention": Readout(lambda cls, patches: patches, lambda dim: QUERIES * dim, AttentionPooling),
     "heat_maps": Readout(lambda cls, patches: patches, lambda dim: 2 * len(POINTS), HeatMaps, points=POINT_NAMES),
 }
+
+
+def in_each(cameras: int, readout: Readout, dim: int) -> nn.Module:
+    """What trains of a readout of so many cameras, for an encoder's features of length `dim`."""
+    if readout.build is None:
+        return nn.Identity()
+    return readout.build(dim) if cameras == 1 else InEach([readout.build(dim) for _ in range(cameras)])

@@ -34,17 +34,19 @@ class SharedEncoders:
             policy.backbone = cache.policy.backbone
 
     def __call__(self, batches: Mapping[int, dict]) -> dict[int, dict | Exception]:
-        """Return preprocessed batches of one frame each, by policy, with `POOLED` beside the image.
+        """Return preprocessed batches of one frame each, by policy, with `POOLED` beside the images.
 
-        A batch without the image stays as it is. An encoder that fails fails for the policies that share it, whose
+        A batch without an image stays as it is. An encoder that fails fails for the policies that share it, whose
         exception stands in place of their batches.
         """
         seen: dict[int, dict | Exception] = dict(batches)
         for cache in self._caches.values():
-            key = cache.policy.config.image_key
-            numbers = [number for number in batches if self._members[number] is cache and key in batches[number]]
+            keys = cache.policy.config.image_keys
+            own = [number for number in batches if self._members[number] is cache]
+            numbers = [number for number in own if all(key in batches[number] for key in keys)]
             try:
-                pooled = cache.pool([batches[number][key] for number in numbers])
+                each = [cache.pool([batches[number][key] for number in numbers]) for key in keys]
+                pooled = [torch.cat(parts, dim=1) for parts in zip(*each, strict=True)]
             except Exception as error:
                 seen |= dict.fromkeys(numbers, error)
                 continue

@@ -97,7 +97,7 @@ def _read_table(
     """
     config, columns = policy.config, dataset.hf_dataset.with_format("numpy")
     points = [config.point_key] if policy.readout.points else []
-    names = [config.feature_key, "index", *config.input_features, *points]
+    names = [config.feature_key, "index", "task_index", *config.input_features, *points]
     table = {name: torch.as_tensor(columns[name][:]) for name in names if name in columns.column_names}
     episodes = _episodes(dataset)
     last = torch.searchsorted(episodes, episodes, right=True)[:, None] - 1
@@ -109,11 +109,14 @@ def _read_table(
 
 def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tuple[Tensor, ...]:
     """Return what the heads see of every row; patch features that a readout learns from stay on the disk."""
-    state = (table[OBS_STATE],) if policy.config.use_state else ()
+    beside = [table[OBS_STATE]] if policy.config.use_state else []
+    if policy.told:
+        beside.append(policy.told(policy.config.sentences)[table["task_index"]])
+    side = (torch.cat(beside, dim=-1),) if beside else ()
     if policy.readout.learns:
-        return open_patches(policy.patches_root), *state
-    pooled = [policy.head_inputs(rows)[0] for rows in _split(table)]
-    return torch.cat(pooled), *state
+        return open_patches(policy.patches_root), *side
+    pooled = [policy.pooled(rows) for rows in _split(table)]
+    return torch.cat(pooled), *side
 
 
 def _split(table: dict[str, Tensor], size: int = 256) -> Iterator[dict[str, Tensor]]:

