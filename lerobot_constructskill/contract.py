@@ -63,6 +63,12 @@ Measured by benchmarks/response.py. In y and z the first step after a rest moves
 GRIPPER = "gripper"
 """Last action channel, continuous: +1 open, -1 closed, in between as `FINGER_TARGETS` says."""
 
+FULL_ACTION = (*TRANSLATION, *ROTATION, GRIPPER)
+"""The channels that every task can be given, so that one policy has them all."""
+
+ACTIONS = TASK_ACTION, ANY_ACTION = "task", "full"
+"""The two forms of an action: the channels that the task's row names, or `FULL_ACTION`."""
+
 FINGER_TARGETS = (-0.01, 0.04)
 """Position in metres that each finger is driven to at -1 and at +1, linear in between: at 0 it is 0.015 m."""
 
@@ -197,7 +203,7 @@ SUITES = {
     "orders": tuple(ORDERS),
     "wall": ("course_of_three", "bond_of_five", "lintel_on_posts"),
 }
-"""Suite name to its tasks; the tasks of one suite share their action, so one policy can be asked all of them."""
+"""Suite name to its tasks; the tasks of one suite share their action."""
 
 PLANNED = "plan:"
 """Before the name or file of a plan, where a task is asked for: the wall of that plan."""
@@ -416,29 +422,35 @@ def label_of(task: str) -> str:
     return re.sub(r"[^\w.-]", "_", task)
 
 
-def get_task(name: str) -> Task:
+def get_task(name: str, action: str = TASK_ACTION) -> Task:
     """Return the row called `name`.
+
+    Args:
+        action: one of `ACTIONS`; in the full form the row names all channels.
 
     Raises:
         ValueError: there is no such task; the message lists those there are.
     """
     tasks = _all_tasks()
     if name.startswith(PLANNED) and name != PLANNED:
-        return replace(PLAN_TASK, name=name, plan=name.removeprefix(PLANNED))
-    if name not in tasks:
+        row = replace(PLAN_TASK, name=name, plan=name.removeprefix(PLANNED))
+    elif name not in tasks:
         raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}; and {PLANNED}NAME_OR_FILE.")
-    return tasks[name]
+    else:
+        row = tasks[name]
+    return replace(row, action_names=FULL_ACTION) if action == ANY_ACTION else row
 
 
 LOOSE = "constructskill"
 """Name under which the results of tasks that were chosen one by one are kept."""
 
 
-def select_tasks(names: str) -> dict[str, list[Task]]:
+def select_tasks(names: str, action: str = TASK_ACTION) -> dict[str, list[Task]]:
     """The rows that `names` asks for, by suite.
 
     Args:
         names: a task, a suite, or several of them with commas between.
+        action: as of `get_task`.
 
     Raises:
         ValueError: a name is neither a task nor a suite, is given twice, or the tasks differ in their action.
@@ -449,12 +461,13 @@ def select_tasks(names: str) -> dict[str, list[Task]]:
         if suite == LOOSE and name not in _all_tasks() and not name.startswith(PLANNED):
             tasks, suites = ", ".join(_all_tasks()), ", ".join(SUITES)
             raise InputError(f"Unknown task '{name}'; the tasks are: {tasks}; the suites: {suites}.")
-        selected.setdefault(suite, []).extend(get_task(member) for member in members)
+        selected.setdefault(suite, []).extend(get_task(member, action) for member in members)
     rows = [row for suite in selected.values() for row in suite]
     if len(set(rows)) < len(rows):
         raise InputError(f"'{names}' names a task twice; name each once.")
     if len({row.action_names for row in rows}) > 1:
         raise InputError(
-            f"'{names}' mixes tasks whose actions differ; choose tasks that share {rows[0].action_names}."
+            f"'{names}' mixes tasks whose actions differ; choose tasks that share {rows[0].action_names}, or "
+            f"action={ANY_ACTION}, which gives every task {len(FULL_ACTION)} numbers."
         )
     return selected

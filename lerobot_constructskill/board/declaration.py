@@ -5,7 +5,7 @@ from typing import Annotated
 
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
 from lerobot_constructskill.bounds import UNSEEN, Among, Checked, NotEmpty, Pattern, Seed, check
-from lerobot_constructskill.contract import OBS_TYPES, TASKS, get_task
+from lerobot_constructskill.contract import FULL_ACTION, OBS_TYPES, TASKS
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Yaml
 
@@ -144,7 +144,7 @@ class Declaration:
     def most_bytes(self) -> int:
         """Bytes of all actions, unpacked, if every episode ran to its end."""
         return len(self.training_seeds) * sum(
-            4 * len(get_task(setting.task).action_names) * setting.episodes * setting.episode_length
+            4 * len(FULL_ACTION) * setting.episodes * setting.episode_length
             for setting in self.settings.values()
         )
 

@@ -107,9 +107,12 @@ class BoardSetting:
 
 
 def environment_key(
-    task: str, episode_length: int | None = None, perturb: str = "", perturb_seed: int = 0
+    task: str, episode_length: int | None = None, perturb: str = "", perturb_seed: int = 0, action: str = ""
 ) -> tuple[str, int, str]:
-    """Task, length and perturbation of an environment with these arguments: what beside a start decides an episode."""
+    """Task, length and perturbation of an environment with these arguments: what beside a start decides an episode.
+
+    The form of the `action` does not: a policy is free to act in either.
+    """
     return task, episode_length or get_task(task).horizon, Perturbation(perturb, perturb_seed).label
 
 

@@ -64,7 +64,7 @@ def _execute(claims: Sequence[Claim], workers: int | None) -> list[str]:
     """The differences of some episodes, which are in the order of their settings."""
     jobs = [
         some
-        for _, own in groupby(claims, key=lambda claim: claim.setting)
+        for _, own in groupby(claims, key=lambda claim: (claim.setting, claim.action))
         for some in batched(own, TOGETHER)  # noqa: B911  the last one may be shorter
     ]
     found: list[str] = []

@@ -180,7 +180,7 @@ def _rules_of_failed(claim: Claim) -> list[tuple[bool, str]]:
 
 def _rules(claim: Claim) -> list[tuple[bool, str]]:
     """Whether each rule for an episode that ran to its end holds, and the rule."""
-    numbers, steps, stage = len(get_task(claim.task).action_names), claim.steps, claim.stage
+    numbers, steps, stage = len(get_task(claim.task, claim.action).action_names), claim.steps, claim.stage
     return [
         (stage in STAGES, f"stage must be one of {', '.join(STAGES)}"),
         (1 <= steps <= claim.episode_length, f"steps must be 1 to {claim.episode_length}"),
@@ -217,7 +217,7 @@ def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:
     for claim in claims:
         if claim.placed:
             acted = claim.training_seed, Perturbation(claim.perturb, claim.perturb_seed).pictures
-            executed = within_reach(claim.executed, get_task(claim.task).action_names) + 0.0  # -0.0 is 0.0
+            executed = within_reach(claim.executed, get_task(claim.task, claim.action).action_names)
             other, as_other = first.setdefault((claim.task, claim.evaluation_seed, executed.tobytes()), (claim, acted))
             if acted != as_other:
                 raise InputError(f"{claim.label} has exactly the actions of {other.label}.")

@@ -1,6 +1,7 @@
 """Scripted experts: pure functions of the privileged state and of their own progress, without the environment."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib import import_module
 from typing import Annotated, Protocol
@@ -8,7 +9,7 @@ from typing import Annotated, Protocol
 import numpy as np
 
 from lerobot_constructskill.bounds import Range, Steps, check
-from lerobot_constructskill.contract import ACTION_SCALE, Task
+from lerobot_constructskill.contract import ACTION_SCALE, Task, get_task
 from lerobot_constructskill.demos.state import PrivilegedState
 
 
@@ -123,7 +124,37 @@ class Expert(Protocol):
         """
 
 
+class Widened:
+    """An expert whose actions get channels that it does not use, which are 0.
+
+    Args:
+        expert: whose actions.
+        own: the names of its channels.
+        names: those of the actions that it is to give.
+    """
+
+    def __init__(self, expert: Expert, own: Sequence[str], names: Sequence[str]):
+        self.expert, self.size, self.places = expert, len(names), [names.index(name) for name in own]
+
+    def start(self, state: PrivilegedState) -> ExpertProgress:
+        return self.expert.start(state)
+
+    def act(self, state: PrivilegedState, progress: ExpertProgress) -> tuple[np.ndarray, Phase, ExpertProgress | None]:
+        action, phase, progress = self.expert.act(state, progress)
+        return self._wide(action), phase, progress
+
+    def advise(self, state: PrivilegedState) -> Advice:
+        advice = self.expert.advise(state)
+        return replace(advice, action=self._wide(advice.action))
+
+    def _wide(self, action: np.ndarray) -> np.ndarray:
+        wide = np.zeros(self.size, dtype=np.float32)
+        wide[self.places] = action
+        return wide
+
+
 def make_expert(task: Task, config: ExpertConfig) -> Expert:
-    """The expert of `task`, as its row in the contract table names it."""
+    """The expert of `task`, as its row in the contract table names it; it acts in the row's channels."""
     module, name = task.expert.split(":")
-    return getattr(import_module(module), name)(config)
+    expert, own = getattr(import_module(module), name)(config), get_task(task.name).action_names
+    return expert if task.action_names == own else Widened(expert, own, task.action_names)

@@ -6,6 +6,7 @@ import numpy as np
 
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
+    FULL_ACTION,
     GRIPPER,
     GRIPPER_CLOSED,
     GRIPPER_OPEN,
@@ -22,7 +23,7 @@ CHANNEL_SCALE = {
 """Metres or radians that ManiSkill calls 1.0; divided by, because its reciprocal rounds otherwise and data sets must
 replay bit for bit."""
 
-MANISKILL_CHANNELS = tuple(CHANNEL_SCALE)
+MANISKILL_CHANNELS = FULL_ACTION
 """The channels of ManiSkill's `pd_ee_delta_pose`, in its order."""
 
 
@@ -33,10 +34,16 @@ def action_bounds(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def normalised(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Actions (..., A) with the channels `names` in ManiSkill's numbers, whose range is [-1, 1]."""
-    return actions / np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32)
+    """Actions (..., A) with the channels `names` as ManiSkill takes them, (..., 7), whose range is [-1, 1].
+
+    A channel that is not named is 0, and so is one that is -0.0: both move the robot alike, to the last bit.
+    """
+    scaled = np.zeros((*actions.shape[:-1], len(MANISKILL_CHANNELS)), dtype=np.float32)
+    scale = np.array([CHANNEL_SCALE[name] for name in names], dtype=np.float32)
+    scaled[..., [MANISKILL_CHANNELS.index(name) for name in names]] += actions / scale
+    return scaled
 
 
 def within_reach(actions: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Actions (..., A) in ManiSkill's numbers as they are executed: clipped to [-1, 1]."""
+    """Actions (..., A) as they are executed: as `normalised` gives them, clipped to [-1, 1]."""
     return np.clip(normalised(actions, names), -1, 1)

@@ -10,9 +10,18 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from lerobot_constructskill.bounds import Among, Range, Seed, Steps, check
-from lerobot_constructskill.contract import CAMERAS, FPS, IMAGE_SIZE, OBS_TYPES, PLANNED, STATE_NAMES, select_tasks
+from lerobot_constructskill.contract import (
+    CAMERAS,
+    FPS,
+    IMAGE_SIZE,
+    OBS_TYPES,
+    PLANNED,
+    STATE_NAMES,
+    TASK_ACTION,
+    select_tasks,
+)
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
-from lerobot_constructskill.envs.gym_env import SEEING, ConstructSkillEnv, ObsType, perturbed_task
+from lerobot_constructskill.envs.gym_env import SEEING, ActionForm, ConstructSkillEnv, ObsType, perturbed_task
 from lerobot_constructskill.envs.recording import FOLDER, recording_into
 from lerobot_constructskill.envs.vector_env import NativeVectorEnv, check_unperturbed
 from lerobot_constructskill.errors import InputError, as_field_error
@@ -41,6 +50,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         perturb: `axis=level`, separated by commas, as `perturbations.AXES` lists them, such as `camera=2,light=1`;
             LeRobot keeps the results under names that end in it.
         perturb_seed: seed of what a perturbation draws once.
+        action: `task` (the channels of the task) or `full` (seven numbers in every task: translation in metres,
+            rotation in radians, gripper), which one policy of tasks with and without rotations acts in.
     """
 
     task: str = "brick_to_bin"
@@ -53,6 +64,7 @@ class ConstructSkillEnvConfig(EnvConfig):
     vectorization: Annotated[str, Among(VECTORIZATIONS)] = "process"
     perturb: str = ""
     perturb_seed: Seed = 0
+    action: ActionForm = TASK_ACTION
 
     def __post_init__(self):
         with as_field_error():
@@ -63,8 +75,9 @@ class ConstructSkillEnvConfig(EnvConfig):
                 raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
             if self.vectorization == "native":
                 check_unperturbed(self.perturb)
-            tasks = [row.name for suite in select_tasks(self.task).values() for row in suite]
-            rows = [perturbed_task(name, self.perturb, self.perturb_seed)[0] for name in tasks]
+            rows = [row for suite in select_tasks(self.task, self.action).values() for row in suite]
+            for row in rows:
+                perturbed_task(row.name, self.perturb, self.perturb_seed)
         image = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))
         cameras = {CAMERAS[name].key: image for name in OBS_TYPES[self.obs_type]}
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),)), **cameras}
@@ -75,16 +88,17 @@ class ConstructSkillEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `ConstructSkillEnv`."""
+        """Arguments of `ConstructSkillEnv`; `action` only where it is not the default, as in the digests of runs."""
         names = ("task", "obs_type", "episode_length", "light_robot", "render_backend", "perturb", "perturb_seed")
-        return {name: getattr(self, name) for name in names}
+        acting = {} if self.action == TASK_ACTION else {"action": self.action}
+        return {name: getattr(self, name) for name in names} | acting
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """`{suite: {task number: vector environment}}`; every sub-environment freezes after its episode's end."""
         label = Perturbation(self.perturb, self.perturb_seed).label
         return {
             suite + label: {i: self._vector_env(row.name, n_envs, use_async_envs) for i, row in enumerate(rows)}
-            for suite, rows in select_tasks(self.task).items()
+            for suite, rows in select_tasks(self.task, self.action).items()
         }
 
     def _vector_env(self, task: str, n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:

@@ -13,16 +13,18 @@ from gymnasium import spaces
 
 from lerobot_constructskill.bounds import Among, Seed, Steps, check_fields
 from lerobot_constructskill.contract import (
+    ACTIONS,
     BRICK,
     FPS,
     IMAGE_SIZE,
     LADDER,
     OBS_TYPES,
     STATE_NAMES,
+    TASK_ACTION,
     Task,
     get_task,
 )
-from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS, action_bounds, normalised
+from lerobot_constructskill.envs.actions import action_bounds, normalised
 from lerobot_constructskill.envs.recording import COUNTS, keep, recorder
 from lerobot_constructskill.errors import InputError, MachineError, remedy_of
 from lerobot_constructskill.interface import describe_task
@@ -32,17 +34,20 @@ from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.threads import one_thread
 
 ObsType = Annotated[str, Among(tuple(OBS_TYPES))]
+ActionForm = Annotated[str, Among(ACTIONS)]
 SEEING = ("auto", "gpu", "cpu")
 
 
-def perturbed_task(name: str, perturb: str, perturb_seed: int) -> tuple[Task, Perturbation]:
+def perturbed_task(
+    name: str, perturb: str, perturb_seed: int, action: str = TASK_ACTION
+) -> tuple[Task, Perturbation]:
     """The task and its perturbation.
 
     Raises:
         InputError: no such task, axis or level, a plan that cannot be built, or a brick of another size where none is
             or where it does not fit.
     """
-    task, perturbation = get_task(name), Perturbation(perturb, perturb_seed)
+    task, perturbation = get_task(name, action), Perturbation(perturb, perturb_seed)
     if task.plan is not None:
         check_plan(read_plan(task.plan))
     perturbation.check(task)
@@ -58,8 +63,9 @@ class ConstructSkillEnv(gym.Env):
 
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
     `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
-    that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. The reward is
-    the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of the
+    that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. With
+    `action="full"` it is `contract.FULL_ACTION` in every task; a scene that holds the hand level overwrites rotations
+    that its task does not name. The reward is the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of the
     scene, `clipped_steps`, how many of the episode's actions were clipped, `placements`, how many of the task's are
     done, `chain`, how many before the first that is not, and what was unsafe: `cost` of the step, and of the episode
     `peak_force` (N), `drops`, `knocks` and `collisions`; after a reset also `contract`, as JSON.
@@ -78,9 +84,11 @@ class ConstructSkillEnv(gym.Env):
         perturb_seed: seed of what a perturbation draws once.
         cameras: those of `obs_type` that are rendered, all by default; one is faster than two, and shows the same.
         film: `render` shows shadows and has 720 lines, which takes a CPU several times as long.
+        action: `task` (the channels that the task's row names) or `full` (all seven, so that one policy can have all
+            tasks).
 
     Raises:
-        ValueError: no such task, obs_type, render_backend, camera, axis or level, an episode_length below 1, or a
+        ValueError: no such task, obs_type, action, render_backend, camera, axis or level, an episode_length below 1, or a
             brick drawn too large for its bin.
     """
 
@@ -101,9 +109,10 @@ class ConstructSkillEnv(gym.Env):
         perturb_seed: Seed = 0,
         cameras: tuple[str, ...] | None = None,
         film: bool = False,
+        action: ActionForm = TASK_ACTION,
     ):
         check_fields(ConstructSkillEnv.__init__, locals())
-        self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed)
+        self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed, action)
         self.task = task
         self.task_description = self._row.instruction
         self.obs_type = obs_type
@@ -271,9 +280,7 @@ class ConstructSkillEnv(gym.Env):
         names = self._row.action_names
         if action.shape != (len(names),) or not np.isfinite(action).all():
             raise InputError(f"An action is {len(names)} finite numbers {names}, not {action.tolist()}.")
-        scaled = np.zeros(len(MANISKILL_CHANNELS), dtype=np.float32)
-        scaled[[MANISKILL_CHANNELS.index(name) for name in names]] = normalised(action, names)
-        return scaled
+        return normalised(action, names)
 
     @one_thread()
     def observations(self, obs: dict[str, Any]) -> dict[str, Any]:

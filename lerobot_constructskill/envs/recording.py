@@ -21,7 +21,7 @@ from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.processor import make
 from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
-from lerobot_constructskill.contract import STAGES, get_task, label_of
+from lerobot_constructskill.contract import ANY_ACTION, FULL_ACTION, STAGES, TASK_ACTION, get_task, label_of
 from lerobot_constructskill.perturbations import Perturbation
 
 FOLDER = "CONSTRUCTSKILL_RECORD"
@@ -127,8 +127,14 @@ class Episode:
 
     @property
     def environment(self) -> dict[str, Any]:
-        """The fields named in `ENVIRONMENT`."""
-        return {name: getattr(self, name) for name in ENVIRONMENT}
+        """The fields named in `ENVIRONMENT`, and the form of the action where it is not the default."""
+        acting = {} if self.action == TASK_ACTION else {"action": self.action}
+        return {name: getattr(self, name) for name in ENVIRONMENT} | acting
+
+    @property
+    def action(self) -> str:
+        """The form of its actions, one of `contract.ACTIONS`, as their length tells."""
+        return ANY_ACTION if self.steps and len(self.flat) == len(FULL_ACTION) * self.steps else TASK_ACTION
 
     @property
     def flat(self) -> np.ndarray:
@@ -138,7 +144,7 @@ class Episode:
     @property
     def executed(self) -> np.ndarray:
         """All actions, (steps, A) float32."""
-        return self.flat.reshape(-1, len(get_task(self.task).action_names))
+        return self.flat.reshape(-1, len(get_task(self.task, self.action).action_names))
 
     def write(self, folder: Path) -> None:
         """Write a file of its own, named by what is in it: an equal episode is the same file."""

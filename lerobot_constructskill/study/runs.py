@@ -19,7 +19,7 @@ from lerobot_constructskill.artifacts.digests import digest, file_sha256, finish
 from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Machine, Node, Store
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import TASK_ACTION, get_task
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
@@ -232,7 +232,8 @@ def _agent(job: Job, run: Run) -> Agent:
         return PolicyAgent.from_pretrained(_checkpoint(job, run), **arm.learner.acting)
     data = arm.demonstrations and arm.demonstrations.node
     dataset = data and LeRobotDataset(data.repo_id, root=job.store.folder(data))
-    return REFERENCES[arm.name].agent(get_task(arm.env["task"]), run.seed, dataset)
+    task = get_task(arm.env["task"], arm.env.get("action", TASK_ACTION))
+    return REFERENCES[arm.name].agent(task, run.seed, dataset)
 
 
 def _checkpoint(job: Job, run: Run) -> Path:
