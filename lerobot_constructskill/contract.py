@@ -6,6 +6,7 @@ as privileged state.
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from math import pi, sqrt
@@ -139,9 +140,22 @@ HELD_OUT_EVERY = 8
 """Size of the groups of demonstrations of which the last one is held out of training."""
 
 
-def held_out(n_episodes: int, every: int = HELD_OUT_EVERY) -> list[int]:
-    """Indices of the held-out demonstrations."""
-    return list(range(every - 1, n_episodes, every))
+TASK_NAME = "task_name"
+"""Column of LeRobot's table of episodes in a set of several tasks, of which two may have one instruction."""
+
+
+def held_out(episodes: int | Sequence[str], every: int = HELD_OUT_EVERY) -> list[int]:
+    """Indices of the held-out demonstrations: of each task the last one of every whole group.
+
+    Args:
+        episodes: how many there are of the only task, or the task of each.
+    """
+    if isinstance(episodes, int):
+        return list(range(every - 1, episodes, every))
+    places: dict[str, list[int]] = {}
+    for index, task in enumerate(episodes):
+        places.setdefault(task, []).append(index)
+    return sorted(index for own in places.values() for index in own[every - 1 :: every])
 
 
 STAGES = ("none", "lifted", "in_bin", "placed")

@@ -15,7 +15,6 @@ from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.store import Machine, Node
-from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.rounds import DRIVEN, DRIVING, OUTCOMES, Round, totals
 from lerobot_constructskill.demos.columns import EXPERT, MADE, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.merge import aggregate, write_statistics
@@ -59,7 +58,7 @@ class MergedSet(Node):
             self._add_columns(base, first)
             aggregate(repo_id, [first, *driven], folder, Path(scratch))
         write_statistics(folder)
-        write_meanings(folder, get_task(config.task), config.seen)
+        write_meanings(folder, config.rows, config.seen)
         facts = MADE.read(base.root / SIDECAR)
         facts["dagger"] = {
             "policy": self.rounds[0].policy.learner.facts(),
@@ -70,7 +69,7 @@ class MergedSet(Node):
         write_sidecar(folder, facts)
 
     def _add_columns(self, base: LeRobotDataset, folder: Path) -> None:
-        task, cameras = get_task(self.base.config.task), self.base.config.seen
+        (task,), cameras = self.base.config.rows, self.base.config.seen
         columns, frames = dagger_features(task, cameras), base.num_frames
         values = {
             "dagger.round": np.zeros((frames, 1), dtype=np.int64),

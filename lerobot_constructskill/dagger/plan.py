@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import TASK_ACTION
 from lerobot_constructskill.dagger.merge import MergedSet
 from lerobot_constructskill.dagger.rounds import Round
 from lerobot_constructskill.dagger.settings import DaggerConfig
@@ -30,7 +30,7 @@ class Plan:
         seed: the training seed.
 
     Raises:
-        InputError: the base's labels are not the expert's, or a start would be used twice.
+        InputError: the base has several tasks or labels that are not the expert's, or a start would be used twice.
     """
 
     config: DaggerConfig
@@ -40,6 +40,8 @@ class Plan:
     seed: int
 
     def __post_init__(self):
+        if len(self.base.config.rows) > 1:
+            raise InputError(f"DAgger's rounds are of one task; the base has several, {self.base.config.task}.")
         if self.base.config.labels == "executed":
             raise InputError("The base has executed actions as labels; DAgger needs the expert's.")
         check_apart({"demonstrations": self.base.starts, "rounds": self.config.starts})
@@ -61,16 +63,17 @@ class Plan:
         Raises:
             InputError: the policy reads what the base does not show.
         """
-        base = self.base.config
+        base, (task,) = self.base.config, self.base.config.rows
         check_inputs(self.learner.config, base.obs_type, base.seen)
         light_robot, backend = resolve_rendering(base.light_robot)
+        acting = {} if base.action == TASK_ACTION else {"action": base.action}
         return {
-            "task": base.task,
+            "task": task.name,
             "obs_type": base.obs_type,
-            "episode_length": self.config.max_steps or get_task(base.task).horizon,
+            "episode_length": self.config.max_steps or task.horizon,
             "light_robot": light_robot,
             "render_backend": backend,
-        } | ({"cameras": base.seen} if base.cameras else {})
+        } | ({"cameras": base.seen} if base.cameras else {}) | acting
 
     def data(self, number: int) -> Demonstrations | MergedSet:
         """What policy `number` is trained on: the demonstrations and the first `number` rounds."""

@@ -13,7 +13,6 @@ from lerobot_constructskill.artifacts.digests import file_sha256, versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Machine, Node
-from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.dagger.driving import Drive, RunningEpisode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
@@ -102,7 +101,7 @@ class Round(Node):
         return how | {"seeds": seeds, "environment": self.env, "expert": vars(base.expert), "video": base.video}
 
     def versions(self) -> dict[str, str]:
-        task = get_task(self.base.config.task)
+        (task,) = self.base.config.rows
         own = code_of(__name__, task.scene, task.expert)
         return versions(*DRIVING) | own | self.policy.learner.versions()
 
@@ -118,7 +117,7 @@ class Round(Node):
             MachineError: the disk is full, this machine cannot render, or a simulator died.
         """
         shards, config = folder.with_name(SHARDS), self.base.config
-        task, repo_id = get_task(config.task), self.repo_id
+        (task,), repo_id = config.rows, self.repo_id
         checkpoint = checkpoint_of(self.policy.seeds.start, inputs["policy"])
         finished = {outcome.seed for outcome in whole(shards, OUTCOME, ONE.read)}
         for episode in self._drive(checkpoint, [seed for seed in self.seeds if seed not in finished], machine):
@@ -141,7 +140,7 @@ class Round(Node):
 
     def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[RunningEpisode]:
         agent = PolicyAgent.from_pretrained(checkpoint, **self.policy.learner.acting)
-        expert = make_expert(get_task(self.base.config.task), self.base.config.expert)
+        expert = make_expert(*self.base.config.rows, self.base.config.expert)
         drive = Drive(self.number, self.beta, self.patience)
         yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
 

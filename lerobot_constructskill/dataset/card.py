@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.bounds import check_fields
-from lerobot_constructskill.contract import CAMERAS, DEMO_SEED_START, FPS, OBS_TYPES, ROTATION, get_task, held_out
+from lerobot_constructskill.contract import (
+    CAMERAS,
+    DEMO_SEED_START,
+    FPS,
+    OBS_TYPES,
+    ROTATION,
+    TASK_ACTION,
+    held_out,
+    select_tasks,
+)
 from lerobot_constructskill.dataset.dataset import DataSet, Provenance
 from lerobot_constructskill.demos.columns import SIDECAR, as_made, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
@@ -78,8 +87,8 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     experts = data.rounds == 0
     phases, noise = data.column("phase")[experts], data.column("dart.noise")[experts]
     base = data.column("sim.tcp_pose")[0, :3] - data.column("observation.state")[0, :3]
-    learners = {"dagger": data.facts["dagger"]} if "dagger" in data.facts else {}
-    return learners | {
+    of_some = {name: data.facts[name] for name in ("dagger", "tasks") if name in data.facts}
+    return of_some | {
         "repo_id": data.config.repo_id,
         "generator": generator_facts(data.config),
         "noise_covariance": data.facts["noise_covariance"],
@@ -92,7 +101,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
         "placements": data.has_placements,
         "shortest": min(lengths),
         "longest": max(lengths),
-        "held_out": held_out(len(lengths)),
+        "held_out": held_out(data.task_names),
         "robot_base": [round(float(value), 3) + 0.0 for value in base],
         "phases": {
             str(phase): {
@@ -118,24 +127,26 @@ def _action_range(data: DataSet) -> dict[str, list[float]]:
 
 def render(facts: dict[str, Any]) -> str:
     """The card of a data set with these facts, in Markdown with the Hub's front matter."""
-    task = get_task(facts["generator"]["task"])
+    generator = facts["generator"]
+    selected = select_tasks(generator["task"], generator.get("action", TASK_ACTION))
+    tasks = [task for suite in selected.values() for task in suite]
     columns = dagger_features if "dagger" in facts else demonstration_features
-    seen = facts["generator"].get("cameras") or OBS_TYPES[facts["generator"]["obs_type"]]
-    features = as_made(columns(task, seen), bool(facts.get("joints")), bool(facts.get("placements")))
+    seen = generator.get("cameras") or OBS_TYPES[generator["obs_type"]]
+    features = as_made(columns(tasks[0], seen), bool(facts.get("joints")), bool(facts.get("placements")))
     cameras = [CAMERAS[name] for name in seen]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return render_template(
         "card.md.j2",
         **facts,
-        task=task,
+        of_tasks=tasks,
         fps=FPS,
         seed_start=DEMO_SEED_START,
         cameras=cameras,
-        contract=describe_task(task, [camera.name for camera in cameras]),
+        contract=describe_task(tasks[0], [camera.name for camera in cameras]),
         features={name: feature for name, feature in features.items() if name in MEANINGS},
         meanings=MEANINGS
-        | (ADVISED if "dagger" in facts or facts["generator"]["labels"] == "advice" else {})
-        | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*task.action_names} else {}),
+        | (ADVISED if "dagger" in facts or generator["labels"] == "advice" else {})
+        | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*tasks[0].action_names} else {}),
         sigma_mm=[round(float(value), 2) for value in sigma],
         rename_map=_rename_map([camera.key for camera in cameras]),
     )

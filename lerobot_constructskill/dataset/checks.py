@@ -20,9 +20,10 @@ from lerobot_constructskill.contract import (
     REWARD_LIFTED,
     REWARD_PLACED,
     SIM_STATE,
-    get_task,
+    TASK_NAME,
+    TRANSLATION,
 )
-from lerobot_constructskill.dataset.dataset import DataSet, Provenance
+from lerobot_constructskill.dataset.dataset import DataSet, Provenance, TaskBlock
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
 from lerobot_constructskill.demos.columns import ACTORS, EXPERT, SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
@@ -64,7 +65,7 @@ def check_schema(data: DataSet) -> Iterator[str]:
         check_fields(Provenance, data.facts, f"{SIDECAR}: ")
     except InputError as error:
         yield str(error)
-    task, features, wanted = get_task(data.config.task), data.info["features"], json.loads(json.dumps(data.columns))
+    features, wanted = data.info["features"], json.loads(json.dumps(data.columns))
     yield from (f"info.json has no feature {name}." for name in sorted(wanted.keys() - features.keys()))
     for name in sorted(features.keys() - wanted.keys() - BOOKKEEPING):
         yield f"info.json has the feature {name}, which is not of the contract and which a policy may read."
@@ -75,12 +76,18 @@ def check_schema(data: DataSet) -> Iterator[str]:
     stored = {name for name, feature in wanted.items() if feature["dtype"] != "video"} | BOOKKEEPING
     for name in sorted(stored ^ set(data.rows.columns)):
         yield f"data/ {'has no' if name in stored else 'has an unknown'} column {name}."
+    told = _instructions(data)
     yield from _found(
         {
             f"info.json says {data.info.get('fps')} frames a second, not {FPS}.": data.info.get("fps") != FPS,
-            f"The instruction is {data.tasks}, not '{task.instruction}'.": data.tasks != [task.instruction],
+            f"The instructions are {data.tasks}, not {told}.": data.tasks != told,
         }
     )
+
+
+def _instructions(data: DataSet) -> list[str]:
+    """The instructions of the tasks in their order, each once."""
+    return list(dict.fromkeys(block.task.instruction for block in data.blocks))
 
 
 def check_values(data: DataSet) -> Iterator[str]:
@@ -91,11 +98,14 @@ def check_values(data: DataSet) -> Iterator[str]:
     experts = data.rounds == 0  # a learner's action is bounded by the environment alone
     limits = {"action": ACTION_SCALE, "dart.executed_action": np.where(experts, data.config.noise.clip, ACTION_SCALE)}
     for name, limit in limits.items():
-        largest, most = np.abs(data.column(name)[:, :-1]).max(axis=1), np.max(limit)
+        sizes, axes, most = np.abs(data.column(name)[:, :-1]), len(TRANSLATION), np.max(limit)
+        largest, turned = sizes[:, :axes].max(axis=1), sizes[:, axes:].max(initial=0)
         odd = ~np.isin(data.column(name)[:, -1], (GRIPPER_OPEN, GRIPPER_CLOSED)) & (experts | (name == "action"))
         units = f"{name} reaches {largest.max():.4g} where {most} m a step is the most: these are other units."
+        turns = f"{name} turns by {turned:.4g} where {ACTION_SCALE} rad a step is the most: these are other units."
         gripper = f"{name} has a gripper that is neither +1 nor -1 in {plural(odd.sum(), 'frame')}."
-        yield from _found({units: (largest > limit + 1e-6).any(), gripper: odd.any()})
+        too_far, too_much = (largest > limit + 1e-6).any(), turned > ACTION_SCALE + 1e-6
+        yield from _found({units: too_far, turns: too_much, gripper: odd.any()})
     state, rewards = data.column("observation.state"), (0, REWARD_LIFTED, REWARD_PLACED)
     reach, fingers = np.linalg.norm(state[:, :3], axis=1).max(), state[:, 6:]
     yield from _found(
@@ -152,10 +162,13 @@ def check_noise(data: DataSet) -> Iterator[str]:
 
 def _advice(data: DataSet, rows: np.ndarray) -> np.ndarray:
     """The actions that the expert advises in some frames, (n, channels)."""
-    expert = make_expert(get_task(data.config.task), data.config.expert)
+    experts = {block.task.name: make_expert(block.task, data.config.expert) for block in data.blocks}
     known = {name: data.column(f"sim.{name}") for name in SIM_STATE if f"sim.{name}" in data.columns}
     states = ({name: np.atleast_1d(values[row]) for name, values in known.items()} for row in rows)
-    return np.array([expert.advise(PrivilegedState(**state)).action for state in states])
+    asked = [experts[data.task_of(episode).name] for episode in data.column("episode_index")[rows]]
+    return np.array(
+        [expert.advise(PrivilegedState(**state)).action for expert, state in zip(asked, states, strict=True)]
+    )
 
 
 def check_episodes(data: DataSet) -> Iterator[str]:
@@ -165,17 +178,29 @@ def check_episodes(data: DataSet) -> Iterator[str]:
         yield f"The rows have the episodes {_few(indices)}, the metadata {len(data.episodes)}."
     for span, (_, episode) in zip(spans, data.episodes.iterrows(), strict=False):
         yield from _check_episode(data, span, f"Episode {episode['episode_index']}", episode)
+    yield from _check_tasks(data)
     counts = {"total_episodes": len(spans), "total_frames": rows, "total_tasks": len(data.tasks)}
-    other = data.column("task_index") != 0
-    unknown = f"task_index is of another instruction than the only one in {plural(other.sum(), 'frame')}."
     uncounted = "index does not count the frames of the data set one by one."
     yield from _found(
-        {uncounted: not np.array_equal(data.column("index"), np.arange(rows)), unknown: other.any()}
+        {uncounted: not np.array_equal(data.column("index"), np.arange(rows))}
         | {
             f"info.json says {name} is {data.info.get(name)}, but there are {count}.": data.info.get(name) != count
             for name, count in counts.items()
         }
     )
+
+
+def _check_tasks(data: DataSet) -> Iterator[str]:
+    """Every frame has its task's instruction, and in a set of several tasks every episode its task's name."""
+    instructions = _instructions(data)
+    wanted = np.array([instructions.index(data.task_of(episode).instruction) for episode in range(len(data.episodes))])
+    episodes = np.clip(data.column("episode_index"), 0, len(wanted) - 1)
+    other = data.column("task_index") != wanted[episodes]
+    said = f"task_index is of another instruction than the episode's in {plural(other.sum(), 'frame')}."
+    named, is_one = data.episodes.get(TASK_NAME), len(data.blocks) == 1
+    is_named = named is None if is_one else named is not None and named.tolist() == data.task_names
+    unnamed = f"meta/episodes/ must have {'no ' if is_one else ''}{TASK_NAME}, the name of each episode's task."
+    yield from _found({said: other.any(), unnamed: not is_named})
 
 
 def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[str]:
@@ -221,9 +246,11 @@ def check_duplicates(data: DataSet) -> Iterator[str]:
 
 
 def check_hold_out(data: DataSet) -> Iterator[str]:
-    """Holding out whole episodes separates seeds: no seed makes two episodes, and none is an evaluation's."""
-    seeds, counts = np.unique(data.column("sim.seed")[[span.start for span in data.spans()]], return_counts=True)
-    twice, low = seeds[counts > 1], seeds[seeds < DEMO_SEED_START]
+    """Holding out whole episodes separates seeds: none makes two episodes of a task, and none is an evaluation's."""
+    found = data.column("sim.seed")[[span.start for span in data.spans()]]
+    counted = [np.unique(found[block.episodes.start : block.episodes.stop], return_counts=True) for block in data.blocks]
+    twice = np.unique(np.concatenate([seeds[counts > 1] for seeds, counts in counted]))
+    low = np.unique(found[found < DEMO_SEED_START])
     yield from _found(
         {
             f"Seeds {_few(twice)} made several episodes, so holding one out does not hold it out.": len(twice),
@@ -249,22 +276,33 @@ def check_statistics(data: DataSet) -> Iterator[str]:
 
 
 def check_provenance(data: DataSet) -> Iterator[str]:
-    starts = [span.start for span in data.spans() if data.rounds[span.start] == 0]
-    seeds, discarded = data.column("sim.seed")[starts].tolist(), data.facts["discarded_seeds"]
-    attempts = range(data.config.seed_start, data.config.seed_start + data.facts["attempts"])
     drawn, told = data.config.noise.root @ data.config.noise.root, data.facts["noise_covariance"]
     missing = ", ".join(sorted(set(FRAME_PACKAGES) - data.facts["versions"].keys()))
     yield from check_rounds(data)
+    for block in data.blocks:
+        yield from _check_attempts(data, block)
     yield from _found(
         {
-            "The seeds of the episodes and the discarded ones are not those of the attempts, one by one.": (
-                not _counts(sorted([*seeds, *discarded]), attempts)
-            ),
-            "The episodes are not in the order of their seeds.": seeds != sorted(seeds),
             f"noise_covariance is {told}; of the settings it is {drawn.tolist()}.": not _is_close(told, drawn),
             f"The versions of {missing} are not recorded.": missing,
             "Whether the light robot was drawn is not recorded.": data.config.light_robot is None,
             f"{MODALITY} is missing.": not (data.root / MODALITY).is_file(),
+        }
+    )
+
+
+def _check_attempts(data: DataSet, block: TaskBlock) -> Iterator[str]:
+    starts = [data.spans()[episode].start for episode in block.episodes if episode < len(data.spans())]
+    seeds = [int(seed) for seed in data.column("sim.seed")[starts][data.rounds[starts] == 0]]
+    attempts, of = range(data.config.seed_start, data.config.seed_start + block.attempts), ""
+    if len(data.blocks) > 1:
+        of = f" of {block.task.name}"
+    yield from _found(
+        {
+            f"The seeds of the episodes{of} and the discarded ones are not those of the attempts, one by one.": (
+                not _counts(sorted([*seeds, *block.discarded_seeds]), attempts)
+            ),
+            f"The episodes{of} are not in the order of their seeds.": seeds != sorted(seeds),
         }
     )
 

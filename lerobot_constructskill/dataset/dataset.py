@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
-from lerobot_constructskill.contract import FPS, get_task
+from lerobot_constructskill.contract import FPS, TASK_NAME, Task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
     PLACEMENT_COLUMNS,
@@ -60,6 +60,13 @@ class Rounds(TypedDict):
     rounds: list[dict[str, Any]]
 
 
+class Tried(TypedDict):
+    """The attempts at one of several tasks."""
+
+    attempts: Count
+    discarded_seeds: list[Seed]
+
+
 class Provenance(TypedDict):
     """How a data set was made: what is read of `meta/constructskill.json`, beside other fields."""
 
@@ -69,10 +76,28 @@ class Provenance(TypedDict):
     versions: dict[Word, Version]
     noise_covariance: list[list[float]]
     sha256: dict[str, str]
+    tasks: NotRequired[dict[str, Tried]]
     dagger: NotRequired[Rounds]
 
 
 PROVENANCE = Json("the record of how a data set was made", Provenance)
+
+
+@dataclass(frozen=True)
+class TaskBlock:
+    """The episodes of one task.
+
+    Args:
+        task: its row.
+        episodes: their indices.
+        attempts: how many were made.
+        discarded_seeds: those of the attempts that failed.
+    """
+
+    task: Task
+    episodes: range
+    attempts: int
+    discarded_seeds: list[int]
 
 
 @dataclass(frozen=True)
@@ -123,13 +148,39 @@ class DataSet:
         return decode(GenerateConfig, self.facts["generator"])
 
     @cached_property
+    def blocks(self) -> list[TaskBlock]:
+        """Its tasks in their order, as the provenance tells them; of the only task all episodes are.
+
+        Raises:
+            InputError: the provenance does not say what was attempted of one of several tasks.
+        """
+        rows, told, each = self.config.rows, self.facts, self.config.episodes
+        if len(rows) == 1:
+            return [TaskBlock(rows[0], range(len(self.episodes)), told["attempts"], told["discarded_seeds"])]
+        if [*told.get("tasks", {})] != [row.name for row in rows]:
+            raise InputError(f"{SIDECAR} does not say in tasks what was attempted of each of {self.config.task}.")
+        return [
+            TaskBlock(row, range(number * each, (number + 1) * each), **told["tasks"][row.name])
+            for number, row in enumerate(rows)
+        ]
+
+    @property
+    def task_names(self) -> list[str]:
+        """The name of each episode's task, as the provenance tells it."""
+        return [block.task.name for block in self.blocks for _ in block.episodes]
+
+    def task_of(self, episode: int) -> Task:
+        """The row of an episode's task, the last one's for an episode more than there should be."""
+        return next((block.task for block in self.blocks if episode in block.episodes), self.blocks[-1].task)
+
+    @cached_property
     def columns(self) -> dict[str, dict[str, Any]]:
         """The columns that the data set should have, with DAgger's if a learner drove.
 
         A set without any column of joints, or of placements, was made before these were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
-        features = made(get_task(self.config.task), self.config.seen)
+        features = made(self.config.rows[0], self.config.seen)
         return as_made(features, self.has_joints, self.has_placements)
 
     @property

@@ -12,7 +12,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, er
 from huggingface_hub.utils import filter_repo_objects
 
 from lerobot_constructskill.artifacts.digests import data_sha256, files_below
-from lerobot_constructskill.contract import HELD_OUT_EVERY, held_out
+from lerobot_constructskill.contract import HELD_OUT_EVERY
 from lerobot_constructskill.dataset.dataset import read_info, video_complaints
 from lerobot_constructskill.errors import (
     InputError,
@@ -24,7 +24,7 @@ from lerobot_constructskill.errors import (
     plural,
 )
 from lerobot_constructskill.lerobot_internals import DATA_SET, INFO, TRAIN_CONFIG, TRAINED
-from lerobot_constructskill.training.recipe import FACTS, SAID
+from lerobot_constructskill.training.recipe import FACTS, SAID, held_out_of
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -133,7 +133,7 @@ def choose_held_out(
     Raises:
         InputError: there are no such episodes, or a checkpoint was trained on one that is held out by default.
     """
-    chosen = held_out(dataset.num_episodes) if episodes is None else episodes
+    chosen = held_out_of(dataset) if episodes is None else episodes
     if not chosen:
         raise InputError("Of fewer than eight demonstrations none is held out: name some by --episodes.")
     if not set(chosen) <= set(range(dataset.num_episodes)):

@@ -19,8 +19,9 @@ SHEET_EPISODES, PATH_EPISODES = 3, 20
 
 
 def contact_sheet(data: DataSet, path: Path) -> None:
-    """A row for each of the first episodes and cameras: the start of each phase, and the last frame."""
-    spans = data.spans()[:SHEET_EPISODES]
+    """A row for each of some episodes and cameras: the start of each phase, and the last frame."""
+    episodes = _firsts(data, SHEET_EPISODES)
+    spans = [data.spans()[episode] for episode in episodes]
     phases = data.column("phase")
     wanted = [
         [*(span.start + int(np.argmax(phases[span] == phase)) for phase in Phase), span.stop - 1] for span in spans
@@ -36,14 +37,14 @@ def contact_sheet(data: DataSet, path: Path) -> None:
             axis.set(xticks=[], yticks=[])
             if index == 0:
                 axis.set_title(title, fontsize=9, color=COLOURS.get(title, "black"))
-        axes[index, 0].set_ylabel(f"{camera.split('.')[-1]}, episode {index // len(data.cameras)}", fontsize=8)
+        axes[index, 0].set_ylabel(f"{camera.split('.')[-1]}, episode {episodes[index // len(data.cameras)]}", fontsize=8)
     _save(figure, path)
 
 
 def trajectories(data: DataSet, path: Path) -> None:
-    """Paths of the first episodes' end effector from above and from the side, coloured by phase, with the bin."""
+    """Paths of some episodes' end effector from above and from the side, coloured by phase, with the first one's bin."""
     position, phases = data.column("sim.tcp_pose")[:, :3], data.column("phase")
-    spans = data.spans()[:PATH_EPISODES]
+    spans = [data.spans()[episode] for episode in _firsts(data, PATH_EPISODES)]
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     for axis, (across, up), title in zip(figure.subplots(1, 2), ((0, 1), (1, 2)), ("from above", "side"), strict=True):
         center, extent = data.column("sim.bin_position")[0], data.column("sim.bin_interior")[0]
@@ -61,6 +62,12 @@ def trajectories(data: DataSet, path: Path) -> None:
         axis.plot([], [], color=colour, label=phase)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
     _save(figure, path)
+
+
+def _firsts(data: DataSet, most: int) -> list[int]:
+    """The first episodes of each task, so many in all at most."""
+    each = max(1, most // len(data.blocks))
+    return [episode for block in data.blocks for episode in block.episodes[:each]][:most]
 
 
 def _save(figure: Figure, path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from lerobot_constructskill.contract import held_out
+from lerobot_constructskill.contract import TASK_NAME, held_out
 from lerobot_constructskill.dataset.dataset import read_info
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
@@ -41,18 +41,31 @@ def split_of(root: Path) -> Split:
     """
     read_info(root)
     files = sorted(root.glob("meta/episodes/*/*.parquet"))
-    tables = [read_parquet(file, SCHEMA.names) for file in files]
-    for file, table in zip(files, tables, strict=True):
-        if not table.schema.equals(SCHEMA) or any(column.null_count for column in table.columns):
-            raise InputError(f"'{file}' must have an index, a length and tasks in every row.")
+    tables = [_read(file) for file in files]
     rows = pa.concat_tables(tables).sort_by("episode_index").to_pylist() if tables else []
     if not rows:
         raise InputError(f"The data set in {root} has no episodes.")
-    return split([row["length"] for row in rows], [next(iter(row["tasks"]), "") for row in rows])
+    names = [row[TASK_NAME] for row in rows] if all(TASK_NAME in row for row in rows) else None
+    return split([row["length"] for row in rows], [next(iter(row["tasks"]), "") for row in rows], names)
 
 
-def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
-    """The split of episodes with these lengths, in frames, and these tasks.
+def _read(file: Path) -> pa.Table:
+    """The columns of `SCHEMA` of a file of episodes, and the names of their tasks in a set of several."""
+    table = read_parquet(file)
+    named = [pa.field(TASK_NAME, pa.string())] if TASK_NAME in table.column_names else []
+    schema = pa.schema([*SCHEMA, *named])
+    if absent := [name for name in schema.names if name not in table.column_names]:
+        raise InputError(f"'{file}' has no column {absent[0]}.")
+    table = table.select(schema.names)
+    if not table.schema.equals(schema) or any(column.null_count for column in table.columns):
+        raise InputError(f"'{file}' must have an index, a length and tasks in every row.")
+    return table
+
+
+def split(lengths: Sequence[int], tasks: Sequence[str], names: Sequence[str] | None = None) -> Split:
+    """The split of episodes with these lengths, in frames, and these instructions, LeRobot's tasks.
+
+    In a set of several tasks `names` are those of the episodes' tasks, and every eighth of each of them is held out.
 
     LeRobot takes ceil(n * eval_split) of the n episodes of each task. That is k, as many as the contract holds out,
     where eval_split is above (k - 1) / n and at most k / n; the middle of what is right for all tasks is taken.
@@ -60,7 +73,7 @@ def split(lengths: Sequence[int], tasks: Sequence[str]) -> Split:
     Raises:
         InputError: there is nothing that is right for all tasks.
     """
-    out = set(held_out(len(lengths)))
+    out = set(held_out(names or len(lengths)))
     frames = sum(length for episode, length in enumerate(lengths) if episode not in out)
     places = {task: [episode for episode, one in enumerate(tasks) if one == task] for task in dict.fromkeys(tasks)}
     counts = [(len(out.intersection(own)), len(own)) for own in places.values()]  # held out, and all

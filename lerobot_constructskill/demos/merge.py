@@ -10,11 +10,11 @@ import numpy as np
 
 from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.artifacts.disk import room_for
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import TASK_NAME
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.metadata import file_hashes, write_meanings
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
-from lerobot_constructskill.demos.shards import EPISODE, Attempt
+from lerobot_constructskill.demos.shards import Block
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
 
@@ -25,12 +25,13 @@ GROUP = 32
 """Data sets that are aggregated at a time."""
 
 
-def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder: Path) -> None:
-    """Write the data set of `attempts`, which are in the order of their seeds, to `folder`.
+def merge(config: GenerateConfig, blocks: list[Block], folder: Path) -> None:
+    """Write the data set of `blocks`, whose attempts are in the order of their seeds, to `folder`.
 
     Raises:
         ValueError: the attempts were drawn in different ways, on machines that are not alike.
     """
+    attempts = [attempt for block in blocks for attempt in block.attempts]
     if len({attempt.light_robot for attempt in attempts}) > 1:
         raise InputError(
             "Some attempts drew the light robot and some the full one, on machines with and without a GPU: "
@@ -38,24 +39,43 @@ def merge(config: GenerateConfig, attempts: list[Attempt], shards: Path, folder:
         )
     if len(backends := {attempt.backend for attempt in attempts}) > 1:
         raise InputError(
-            f"Some attempts were made by {' and some by '.join(sorted(backends))}: remove {shards} and generate all "
-            "of them on machines of one kind."
+            f"Some attempts were made by {' and some by '.join(sorted(backends))}: remove {blocks[0].shards.parent} "
+            "and generate all of them on machines of one kind."
         )
-    roots = [shards / str(attempt.seed) / EPISODE for attempt in attempts if attempt.success]
+    roots = [root for block in blocks for root in block.demonstrations]
     # The disk's room is measured before the scratch folder is gone.
-    with tempfile.TemporaryDirectory(dir=shards) as scratch, room_for(folder):
+    with tempfile.TemporaryDirectory(dir=blocks[0].shards) as scratch, room_for(folder):
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
-    write_meanings(folder, get_task(config.task), config.seen)
+    write_meanings(folder, config.rows, config.seen)
+    of_tasks = {}
+    if len(blocks) > 1:
+        name_tasks(folder, [block.config.task for block in blocks for _ in block.demonstrations])
+        of_tasks["tasks"] = {
+            block.config.task: {"attempts": len(block.attempts), "discarded_seeds": block.discarded}
+            for block in blocks
+        }
     facts = {
         "generator": generator_facts(config) | {"light_robot": attempts[0].light_robot},
         "noise_covariance": (config.noise.root @ config.noise.root).tolist(),
         "attempts": len(attempts),
-        "discarded_seeds": [attempt.seed for attempt in attempts if not attempt.success],
-        "versions": frame_versions(config.task),
+        "discarded_seeds": [seed for block in blocks for seed in block.discarded],
+        **of_tasks,
+        "versions": frame_versions(config),
         "sha256": file_hashes(folder),
     }
     (folder / SIDECAR).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+
+
+def name_tasks(folder: Path, names: list[str]) -> None:
+    """Write the name of each episode's task into LeRobot's table of episodes."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    for path in (folder / "meta" / "episodes").glob("*/*.parquet"):
+        table = read_parquet(path)
+        own = [names[episode] for episode in table["episode_index"].to_pylist()]
+        pq.write_table(table.append_column(TASK_NAME, pa.array(own)), path)
 
 
 def aggregate(repo_id: str, roots: list[Path], folder: Path, scratch: Path) -> None:

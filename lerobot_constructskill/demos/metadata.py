@@ -1,7 +1,7 @@
 """What stands beside the frames of a data set: GR00T's `meta/modality.json`, our `meta/contract.json`, and hashes."""
 
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,19 @@ STATE_PARTS = {
 ACTION_PARTS = {"end_effector_position": TRANSLATION, "end_effector_rotation": ROTATION, "gripper": (GRIPPER,)}
 
 
-def write_meanings(root: Path, task: Task, cameras: Collection[str]) -> None:
-    """Write both files of a data set of `task` seen by `cameras`."""
-    for name, content in ((MODALITY, modality(task, cameras)), (CONTRACT, describe_task(task, cameras))):
+def write_meanings(root: Path, tasks: Sequence[Task], cameras: Collection[str]) -> None:
+    """Write both files of a data set of `tasks`, whose actions are alike, seen by `cameras`."""
+    for name, content in ((MODALITY, modality(tasks[0], cameras)), (CONTRACT, meaning(tasks, cameras))):
         (root / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def meaning(tasks: Sequence[Task], cameras: Iterable[str]) -> dict[str, Any]:
+    """The contract of `tasks`; several stand in a list `tasks`, each with its name and instruction."""
+    contract = describe_task(tasks[0], cameras)
+    if len(tasks) == 1:
+        return contract
+    named = {"tasks": [{"task": task.name, "instruction": task.instruction} for task in tasks]}
+    return named | {name: value for name, value in contract.items() if name not in ("task", "instruction")}
 
 
 def modality(task: Task, cameras: Iterable[str]) -> dict[str, Any]:

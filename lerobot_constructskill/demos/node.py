@@ -36,7 +36,7 @@ class Demonstrations(Node):
         return facts | frame_facts(self.config) | {"light_robot": light_robot, "render_backend": backend}
 
     def versions(self) -> dict[str, str]:
-        return frame_versions(self.config.task)
+        return frame_versions(self.config)
 
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Generate the demonstrations. Raises as `recorder.record` does."""

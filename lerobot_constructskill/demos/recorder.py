@@ -6,7 +6,7 @@ shards that it finished.
 
 import logging
 import shutil
-from concurrent.futures import FIRST_COMPLETED, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from itertools import count
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from lerobot_constructskill.artifacts.pools import open_pool
 from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
-from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, attempt, whole
+from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, Block, attempt, whole
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
 from lerobot_constructskill.progress import Progress, quiet
@@ -34,7 +34,8 @@ def record(config: GenerateConfig) -> tuple[Path, list[Attempt]]:
     settings are not looked at.
 
     Returns:
-        The data set's root, and all attempts in the order of their seeds, the failed and discarded ones among them.
+        The data set's root, and all attempts, task by task in the order of their seeds, the failed and discarded ones
+        among them.
 
     Raises:
         FileExistsError: the root exists already, or another process is writing it.
@@ -59,58 +60,77 @@ def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
             "them has seen its start.",
             *(starts.start, starts.stop - 1, DEMO_SEED_START, DEMO_SEED_STOP - 1),
         )
-    shards = folder.with_name(SHARDS) / frames_digest(config)
-    before = frame_versions(config.task)
-    attempts = _run_attempts(config, shards)
-    check_unedited(before, frame_versions(config.task))
+    shards = folder.with_name(SHARDS)
+    blocks = [Block(part, shards / frames_digest(part)) for part in config.parts]
+    before = frame_versions(config)
+    _run_attempts(config, blocks)
+    check_unedited(before, frame_versions(config))
     with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
-        merge(config, attempts, shards, folder)
-    return attempts
+        merge(config, blocks, folder)
+    return [attempt for block in blocks for attempt in block.attempts]
 
 
-def _run_attempts(config: GenerateConfig, shards: Path) -> list[Attempt]:
-    """Run attempts, or find their shards, until enough have succeeded; return them in the order of their seeds.
+def _run_attempts(config: GenerateConfig, blocks: list[Block]) -> None:
+    """Run attempts, or find their shards, until enough have succeeded in every block.
 
-    No more attempts run at once than are still needed, so which seeds are taken does not depend on the workers.
+    No more attempts of a block run at once than it still needs, so which seeds are taken does not depend on the
+    workers.
     """
-    before = {outcome.seed: outcome for outcome in whole(shards, OUTCOME, ATTEMPT.read)}
-    attempts, running = [], set()
-    seeds = count(config.seed_start)
-    found = min(config.episodes, sum(outcome.success for outcome in before.values()))
+    before = [{one.seed: one for one in whole(block.shards, OUTCOME, ATTEMPT.read)} for block in blocks]
+    seeds = [count(config.seed_start) for _ in blocks]
+    running: dict[Future, int] = {}  # to the number of the block
+    found = sum(min(config.episodes, sum(one.success for one in known.values())) for known in before)
+    total = config.episodes * len(blocks)
     # Smoothed, so that the start of the simulators, part of the first demonstration's time, counts less and less.
-    bar = Progress(total=config.episodes, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
+    bar = Progress(total=total, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
     with bar, open_pool(config.executor, config.workers) as submit:
         while True:
-            successes = sum(outcome.success for outcome in attempts)
-            bar.set_postfix(discarded=len(attempts) - successes, refresh=False)
-            bar.update(max(0, successes - bar.n))
-            if (failures := len(attempts) - successes) > config.max_failures * config.episodes:
-                raise InputError(
-                    f"{plural(failures, 'attempt')} failed, more than max_failures={config.max_failures} allows for "
-                    f"{plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
-                )
-            if len(running) < min(config.episodes - successes, config.workers):
-                seed = next(seeds)
-                if seed in before:
-                    attempts.append(before[seed])
+            bar.set_postfix(discarded=sum(len(block.discarded) for block in blocks), refresh=False)
+            bar.update(max(0, sum(len(block.demonstrations) for block in blocks) - bar.n))
+            number = _next_block(config, blocks, [*running.values()])
+            if number is not None and len(running) < config.workers:
+                block, seed = blocks[number], next(seeds[number])
+                if seed in before[number]:
+                    block.attempts.append(before[number][seed])
                 else:
-                    running.add(submit(attempt, config, seed, shards))
+                    running[submit(attempt, block.config, seed, block.shards)] = number
             elif running:
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                attempts += [future.result() for future in done]
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    blocks[running.pop(future)].attempts.append(future.result())
             else:
-                return sorted(attempts, key=lambda outcome: outcome.seed)
+                break
+    for block in blocks:
+        block.attempts.sort(key=lambda outcome: outcome.seed)
+
+
+def _next_block(config: GenerateConfig, blocks: list[Block], running: list[int]) -> int | None:
+    """The number of the first block that needs more attempts than are `running` of it; None where none does.
+
+    Raises:
+        InputError: more attempts of a block failed than `max_failures` allows.
+    """
+    for number, block in enumerate(blocks):
+        if (failures := len(block.discarded)) > config.max_failures * config.episodes:
+            of_task = f" at {block.config.task}" if len(blocks) > 1 else ""
+            raise InputError(
+                f"{plural(failures, 'attempt')}{of_task} failed, more than max_failures={config.max_failures} allows "
+                f"for {plural(config.episodes, 'demonstration')}: check the expert's and the noise's values."
+            )
+        if running.count(number) < config.episodes - len(block.demonstrations):
+            return number
+    return None
 
 
 def check_disk(config: GenerateConfig, root: Path) -> None:
     """Refuse a disk that could not hold the longest episodes twice, as shards and merged."""
-    images = config.episodes * config.max_steps * len(config.seen)
+    episodes = config.episodes * len(config.rows)
+    images = episodes * config.max_steps * len(config.seen)
     needed = 2 * VIDEOS[config.video].bytes_per_image * images
     disk = disk_of(root.parent)
     free = shutil.disk_usage(disk).free
     if free < needed:
         raise MachineError(
-            f"{disk} has {free / 1e6:,.0f} MB free and {plural(config.episodes, 'episode')} of up to "
+            f"{disk} has {free / 1e6:,.0f} MB free and {plural(episodes, 'episode')} of up to "
             f"{plural(config.max_steps, 'step')} can take up to {needed / 1e6:,.0f} MB: make room, name another root, "
             "or ask for fewer."
         )

@@ -1,7 +1,7 @@
 """The settings of `constructskill-generate`, and which of them decide the bytes of frames."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import combinations
 from typing import Annotated, Any
 
@@ -9,7 +9,7 @@ from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
-from lerobot_constructskill.contract import DEMO_SEED_START, OBS_TYPES, get_task
+from lerobot_constructskill.contract import ACTIONS, DEMO_SEED_START, OBS_TYPES, TASK_ACTION, Task, select_tasks
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -30,15 +30,16 @@ class GenerateConfig:
     Args:
         repo_id: the data set's name, `user/name`.
         root: folder to write; `$HF_LEROBOT_HOME/<repo_id>` by default. It must not exist.
-        task: a name in `contract.TASKS`.
-        episodes: successful demonstrations to record.
+        task: a name in `contract.TASKS` or in `contract.SUITES`, or several with commas between: the data set then
+            has their demonstrations one task after another, in this order.
+        episodes: successful demonstrations to record, of each task.
         obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera). The state is always
             recorded.
         cameras: those of `obs_type` that are rendered and recorded, such as `[wrist]`; all by default. One of two
             takes less time and disk.
         max_steps: steps after which an attempt counts as failed.
-        max_failures: failed attempts, as a fraction of `episodes`, above which the run gives up.
-        seed_start: seed of the first attempt; attempt i has seed `seed_start + i`.
+        max_failures: failed attempts at a task, as a fraction of `episodes`, above which the run gives up.
+        seed_start: seed of the first attempt at each task; attempt i has seed `seed_start + i`.
         light_robot: draw the robot with decimated meshes, as in the environment.
         labels: what `action` holds: the expert's `clean` command (the paper), what was `executed` (MimicGen), or the
             expert's `advice` from the state alone, which labels DAgger's rounds.
@@ -46,6 +47,8 @@ class GenerateConfig:
             30 KB: every pixel as it was rendered; few browsers play it).
         stop_at_success: whether a demonstration ends with the placement (five steps in the bin), or only when the
             expert has finished: its last steps, the open hand above the bin, show when to let go.
+        action: the channels of `action`: those of the `task`, or `full`, which tasks with and without rotations share;
+            those that a task does not use are 0.
         expert: its gains, thresholds and dwells (metres, steps).
         noise: what is added to the executed action (metres).
         workers: attempts that run at the same time; the data set does not depend on it.
@@ -69,6 +72,7 @@ class GenerateConfig:
     labels: Annotated[str, Among(LABELS)] = "clean"
     video: Annotated[str, Among(tuple(VIDEOS))] = "av1"
     stop_at_success: bool = True
+    action: Annotated[str, Among(ACTIONS)] = TASK_ACTION
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     workers: Workers = 1
@@ -76,12 +80,22 @@ class GenerateConfig:
 
     def __post_init__(self):
         check(self)
-        get_task(self.task)
+        select_tasks(self.task, self.action)
         if self.cameras is not None and not (self.cameras and {*self.cameras} <= {*OBS_TYPES[self.obs_type]}):
             raise InputError(
                 f"cameras must be some of {', '.join(OBS_TYPES[self.obs_type])}, which {self.obs_type} has, not "
                 f"{', '.join(self.cameras) or 'none'}."
             )
+
+    @property
+    def rows(self) -> list[Task]:
+        """The tasks, whose actions are as asked for."""
+        return [row for suite in select_tasks(self.task, self.action).values() for row in suite]
+
+    @property
+    def parts(self) -> list["GenerateConfig"]:
+        """The settings of each task alone."""
+        return [replace(self, task=row.name) for row in self.rows]
 
     @property
     def seen(self) -> tuple[str, ...]:
@@ -91,7 +105,7 @@ class GenerateConfig:
 
     @property
     def starts(self) -> range:
-        """Seeds of all attempts that the generation may make."""
+        """Seeds of all attempts that the generation may make at each task."""
         return range(self.seed_start, self.seed_start + self.episodes + int(self.max_failures * self.episodes))
 
 
@@ -115,9 +129,10 @@ def check_apart(starts: Mapping[str, range]) -> None:
 def generator_facts(config: GenerateConfig) -> dict[str, Any]:
     """The settings that a data set records: all but where and how fast it was generated."""
     facts = {name: value for name, value in asdict(config).items() if name not in ("root", "workers", "executor")}
-    if not config.cameras:
-        del facts["cameras"]  # so that sets from before there was a choice keep their digests
-    return facts
+    facts["task"] = ",".join(row.name for row in config.rows)  # a suite may get others
+    # What is not asked for is left out, so that sets from before there was a choice keep their digests.
+    left_out = {"cameras": not config.cameras, "action": config.action == TASK_ACTION}
+    return {name: value for name, value in facts.items() if not left_out.get(name)}
 
 
 def frames_digest(config: GenerateConfig) -> str:
@@ -127,18 +142,19 @@ def frames_digest(config: GenerateConfig) -> str:
     """
     others = ("repo_id", "episodes", "max_failures", "seed_start")
     facts = {name: value for name, value in generator_facts(config).items() if name not in others}
-    return digest(facts | frame_facts(config) | {"versions": frame_versions(config.task)})
+    return digest(facts | frame_facts(config) | {"versions": frame_versions(config)})
 
 
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
-    """The encoder's options, the columns and the plan, on which a data set depends beside its settings."""
-    task = get_task(config.task)
-    columns = demonstration_features(task, config.seen)
-    plan = {} if task.plan is None else {"plan": read_plan(task.plan).facts()}
-    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)} | plan
+    """The encoder's options, the columns and the plans, on which a data set depends beside its settings."""
+    columns = demonstration_features(config.rows[0], config.seen)
+    plans = {row.name: read_plan(row.plan).facts() for row in config.rows if row.plan is not None}
+    if plans:
+        plans = {"plans": plans} if len(config.rows) > 1 else {"plan": plans[config.rows[0].name]}
+    return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)} | plans
 
 
-def frame_versions(task: str) -> dict[str, str]:
+def frame_versions(config: GenerateConfig) -> dict[str, str]:
     """Versions that decide frames: packages, our rooms, and the source of another package's scene and expert."""
-    row = get_task(task)
-    return versions(*FRAME_PACKAGES) | code_of(row.scene, row.expert, __name__)
+    made_by = [name for row in config.rows for name in (row.scene, row.expert)]
+    return versions(*FRAME_PACKAGES) | code_of(*made_by, __name__)

@@ -4,12 +4,11 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.contract import FPS, Task, get_task
+from lerobot_constructskill.contract import FPS, Task
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import make_expert
@@ -52,6 +51,31 @@ class Attempt:
 ATTEMPT = Json("an attempt's outcome", Attempt)
 
 
+@dataclass
+class Block:
+    """The attempts at one task's demonstrations.
+
+    Args:
+        config: the settings of this task alone.
+        shards: the folder of their shards.
+        attempts: the outcomes, in the end in the order of their seeds.
+    """
+
+    config: GenerateConfig
+    shards: Path
+    attempts: list[Attempt] = field(default_factory=list)
+
+    @property
+    def demonstrations(self) -> list[Path]:
+        """The data set of each attempt that succeeded."""
+        return [self.shards / str(attempt.seed) / EPISODE for attempt in self.attempts if attempt.success]
+
+    @property
+    def discarded(self) -> list[int]:
+        """Seeds of the attempts that failed."""
+        return [attempt.seed for attempt in self.attempts if not attempt.success]
+
+
 def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     """Run the attempt of `seed` and write its shard `folder/<seed>`, whole or not at all.
 
@@ -59,9 +83,9 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
         FileExistsError: the shard exists, or another process is writing it.
         OSError: this machine cannot render.
     """
-    task = get_task(config.task)
+    (task,) = config.rows
     expert = make_expert(task, config.expert)
-    env = _environment(config.task, config.obs_type, config.max_steps, config.light_robot, config.seen)
+    env = _environment(task.name, config.obs_type, config.max_steps, config.light_robot, config.seen, config.action)
     frames, success = demonstrate(env, expert, config.noise, seed, config.labels, config.stop_at_success)
     outcome = Attempt(seed, success, len(frames), env.light_robot, env.backend)
     with staged(folder / str(seed)) as shard:
@@ -73,12 +97,20 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     return outcome
 
 
-@cache
+_open: dict[tuple, ConstructSkillEnv] = {}
+"""The simulator of this process, by its arguments: one, because each takes memory."""
+
+
 def _environment(
-    task: str, obs_type: str, max_steps: int, light_robot: bool | None, cameras: tuple[str, ...]
+    task: str, obs_type: str, max_steps: int, light_robot: bool | None, cameras: tuple[str, ...], action: str
 ) -> ConstructSkillEnv:
     """The simulator of this process. Its episodes do not depend on each other; a new one compiles shaders for 6 s."""
-    return ConstructSkillEnv(task, obs_type, max_steps, light_robot, cameras=cameras)
+    arguments = task, obs_type, max_steps, light_robot, cameras, action
+    if arguments not in _open:
+        while _open:  # that of the task before
+            _open.popitem()[1].close()
+        _open[arguments] = ConstructSkillEnv(*arguments[:4], cameras=cameras, action=action)
+    return _open[arguments]
 
 
 def whole[Kind](folder: Path, outcome: str, read: Callable[[Path], Kind]) -> list[Kind]:

@@ -15,9 +15,9 @@ from lerobot.utils import OBS_STATE
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Machine, Node
-from lerobot_constructskill.contract import OBS_TYPES, held_out
+from lerobot_constructskill.contract import OBS_TYPES
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.training.recipe import FACTS, Training
+from lerobot_constructskill.training.recipe import FACTS, Training, held_out_of
 from lerobot_constructskill.training.trainers import Learner, flush_denormals
 
 LEARNING = ("lerobot", "torch", "numpy")
@@ -105,7 +105,7 @@ class Checkpoints(Node):
         """Train the seeds. Raises whatever the trainer raises."""
         flush_denormals()
         dataset = LeRobotDataset(self.inputs["data"].repo_id, root=inputs["data"])
-        kept_out = held_out(dataset.num_episodes, self.training.holdout)
+        kept_out = held_out_of(dataset, self.training.holdout)
         folder.mkdir()
         config = deepcopy(self.learner.config)  # which a trainer may change
         made_of = self.learner.trainer.fit(config, dataset, self.seeds, self.training, kept_out, folder)

@@ -11,10 +11,10 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.store import Machine, Node, Store
-from lerobot_constructskill.contract import held_out
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.rollout.offline import heldout_mse
 from lerobot_constructskill.training.checkpoints import Checkpoints, checkpoint_of
+from lerobot_constructskill.training.recipe import held_out_of
 
 FILE = "heldout.json"
 
@@ -46,7 +46,7 @@ class HeldOutError(Node):
     def make(self, folder: Path, inputs: Mapping[str, Path], machine: Machine) -> None:
         """Measure the error. Raises as `rollout.offline.heldout_mse` does."""
         dataset = LeRobotDataset(self.inputs["data"].repo_id, root=inputs["data"])
-        episodes = held_out(dataset.num_episodes, self.checkpoints.training.holdout)
+        episodes = held_out_of(dataset, self.checkpoints.training.holdout)
         checkpoint = checkpoint_of(self.seed, inputs["checkpoint"])
         error = heldout_mse(checkpoint, dataset, episodes, **self.checkpoints.learner.acting)
         folder.mkdir()

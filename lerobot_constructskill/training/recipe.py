@@ -1,11 +1,14 @@
 """How long and on what part of the demonstrations a policy is trained."""
 
 from dataclasses import dataclass
-from typing import Annotated, TypedDict
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 from lerobot_constructskill.bounds import BatchSize, Count, Range, check
-from lerobot_constructskill.contract import HELD_OUT_EVERY
+from lerobot_constructskill.contract import HELD_OUT_EVERY, TASK_NAME, held_out
 from lerobot_constructskill.files import Json
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,14 @@ class Training:
 
     def __post_init__(self):
         check(self, "training.")
+
+
+def held_out_of(dataset: "LeRobotDataset", every: int = HELD_OUT_EVERY) -> list[int]:
+    """The held-out episodes of a data set or of its features; in a set of several tasks they are counted by task."""
+    episodes = dataset.meta.episodes
+    return held_out(
+        episodes[TASK_NAME] if TASK_NAME in episodes.column_names else dataset.num_episodes, every
+    )
 
 
 class _Holdout(TypedDict):

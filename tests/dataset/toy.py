@@ -22,7 +22,7 @@ class ToyEnv:
 
     light_robot, backend = True, "none"
 
-    def __init__(self, task, obs_type, episode_length, light_robot=None, cameras=None):
+    def __init__(self, task, obs_type, episode_length, light_robot=None, cameras=None, action="task"):
         self.cameras, self.episode_length = cameras or OBS_TYPES[obs_type], episode_length
 
     def reset(self, seed):
