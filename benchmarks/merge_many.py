@@ -8,7 +8,7 @@ from pathlib import Path
 from lerobot_constructskill.contract import DEMO_SEED_START
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.demos.shards import attempt
+from lerobot_constructskill.demos.shards import Block, attempt
 
 
 def main(folder: Path, count: int) -> None:
@@ -18,7 +18,7 @@ def main(folder: Path, count: int) -> None:
     attempts = [replace(first, seed=first.seed + number) for number in range(count)]
     for copy in attempts[1:]:
         shutil.copytree(shards / str(first.seed), shards / str(copy.seed))
-    merge(config, attempts, shards, folder / "set")
+    merge(config, [Block(config, shards, attempts)], folder / "set")
 
 
 if __name__ == "__main__":

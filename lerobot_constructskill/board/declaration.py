@@ -144,8 +144,7 @@ class Declaration:
     def most_bytes(self) -> int:
         """Bytes of all actions, unpacked, if every episode ran to its end."""
         return len(self.training_seeds) * sum(
-            4 * len(FULL_ACTION) * setting.episodes * setting.episode_length
-            for setting in self.settings.values()
+            4 * len(FULL_ACTION) * setting.episodes * setting.episode_length for setting in self.settings.values()
         )
 
     @property

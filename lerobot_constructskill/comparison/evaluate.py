@@ -40,6 +40,7 @@ def evaluate(
     by_folder = {}
     for group in batched(source.folders, together):  # noqa: B911  the last one may be smaller
         agents = [PolicyAgent.from_pretrained(checkpoint, device) for checkpoint in group]
+        env = {**env, "action": agents[0].action}
         for checkpoint, agent in zip(group, agents, strict=True):
             try:
                 check_inputs(agent.policy.config, facts["obs_type"])

@@ -67,13 +67,17 @@ class Plan:
         check_inputs(self.learner.config, base.obs_type, base.seen)
         light_robot, backend = resolve_rendering(base.light_robot)
         acting = {} if base.action == TASK_ACTION else {"action": base.action}
-        return {
-            "task": task.name,
-            "obs_type": base.obs_type,
-            "episode_length": self.config.max_steps or task.horizon,
-            "light_robot": light_robot,
-            "render_backend": backend,
-        } | ({"cameras": base.seen} if base.cameras else {}) | acting
+        return (
+            {
+                "task": task.name,
+                "obs_type": base.obs_type,
+                "episode_length": self.config.max_steps or task.horizon,
+                "light_robot": light_robot,
+                "render_backend": backend,
+            }
+            | ({"cameras": base.seen} if base.cameras else {})
+            | acting
+        )
 
     def data(self, number: int) -> Demonstrations | MergedSet:
         """What policy `number` is trained on: the demonstrations and the first `number` rounds."""

@@ -248,7 +248,9 @@ def check_duplicates(data: DataSet) -> Iterator[str]:
 def check_hold_out(data: DataSet) -> Iterator[str]:
     """Holding out whole episodes separates seeds: none makes two episodes of a task, and none is an evaluation's."""
     found = data.column("sim.seed")[[span.start for span in data.spans()]]
-    counted = [np.unique(found[block.episodes.start : block.episodes.stop], return_counts=True) for block in data.blocks]
+    counted = [
+        np.unique(found[block.episodes.start : block.episodes.stop], return_counts=True) for block in data.blocks
+    ]
     twice = np.unique(np.concatenate([seeds[counts > 1] for seeds, counts in counted]))
     low = np.unique(found[found < DEMO_SEED_START])
     yield from _found(

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
-from lerobot_constructskill.contract import FPS, TASK_NAME, Task
+from lerobot_constructskill.contract import FPS, Task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
     PLACEMENT_COLUMNS,

@@ -37,12 +37,14 @@ def contact_sheet(data: DataSet, path: Path) -> None:
             axis.set(xticks=[], yticks=[])
             if index == 0:
                 axis.set_title(title, fontsize=9, color=COLOURS.get(title, "black"))
-        axes[index, 0].set_ylabel(f"{camera.split('.')[-1]}, episode {episodes[index // len(data.cameras)]}", fontsize=8)
+        axes[index, 0].set_ylabel(
+            f"{camera.split('.')[-1]}, episode {episodes[index // len(data.cameras)]}", fontsize=8
+        )
     _save(figure, path)
 
 
 def trajectories(data: DataSet, path: Path) -> None:
-    """Paths of some episodes' end effector from above and from the side, coloured by phase, with the first one's bin."""
+    """Paths of some episodes' end effector from above and from the side, coloured by phase, and the first bin."""
     position, phases = data.column("sim.tcp_pose")[:, :3], data.column("phase")
     spans = [data.spans()[episode] for episode in _firsts(data, PATH_EPISODES)]
     figure = Figure(figsize=(9, 4.2), layout="constrained")

@@ -38,9 +38,7 @@ ActionForm = Annotated[str, Among(ACTIONS)]
 SEEING = ("auto", "gpu", "cpu")
 
 
-def perturbed_task(
-    name: str, perturb: str, perturb_seed: int, action: str = TASK_ACTION
-) -> tuple[Task, Perturbation]:
+def perturbed_task(name: str, perturb: str, perturb_seed: int, action: str = TASK_ACTION) -> tuple[Task, Perturbation]:
     """The task and its perturbation.
 
     Raises:
@@ -64,11 +62,12 @@ class ConstructSkillEnv(gym.Env):
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
     `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
     that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. With
-    `action="full"` it is `contract.FULL_ACTION` in every task; a scene that holds the hand level overwrites rotations
-    that its task does not name. The reward is the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of the
-    scene, `clipped_steps`, how many of the episode's actions were clipped, `placements`, how many of the task's are
-    done, `chain`, how many before the first that is not, and what was unsafe: `cost` of the step, and of the episode
-    `peak_force` (N), `drops`, `knocks` and `collisions`; after a reset also `contract`, as JSON.
+    `action="full"` it is `contract.FULL_ACTION` in every task; a scene that holds the hand level overwrites the
+    rotations that its task does not name. The reward is the stage reached: 0, 0.5 once lifted, 1 once all is placed.
+    `info` holds `is_success`, the named booleans of the scene, `clipped_steps`, how many of the episode's actions were
+    clipped, `placements`, how many of the task's are done, `chain`, how many before the first that is not, and what
+    was unsafe: `cost` of the step, and of the episode `peak_force` (N), `drops`, `knocks` and `collisions`; after a
+    reset also `contract`, as JSON.
 
     Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
@@ -88,8 +87,8 @@ class ConstructSkillEnv(gym.Env):
             tasks).
 
     Raises:
-        ValueError: no such task, obs_type, action, render_backend, camera, axis or level, an episode_length below 1, or a
-            brick drawn too large for its bin.
+        ValueError: no such task, obs_type, action, render_backend, camera, axis or level, an episode_length below 1,
+            or a brick drawn too large for its bin.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from lerobot.envs import preprocess_observation
 from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_processors
+from lerobot.utils import ACTION
 
-from lerobot_constructskill.contract import CAMERAS
+from lerobot_constructskill.contract import ANY_ACTION, CAMERAS, FULL_ACTION, TASK_ACTION
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.policy_types import read_policy
@@ -117,6 +118,12 @@ class PolicyAgent:
         if renamed or not pictures.keys() <= named.keys():
             return tuple(CAMERAS)
         return tuple(named[key] for key in pictures)
+
+    @property
+    def action(self) -> str:
+        """The form of its actions, one of `contract.ACTIONS`, as their number tells."""
+        feature = self.policy.config.output_features.get(ACTION)
+        return ANY_ACTION if feature is not None and feature.shape == (len(FULL_ACTION),) else TASK_ACTION
 
     def reset(self, seed: int) -> None:
         self.policy.reset()

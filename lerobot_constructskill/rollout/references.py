@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED, GRIPPER_OPEN, Task
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_CLOSED, GRIPPER_OPEN, TASK_NAME, Task
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
 from lerobot_constructskill.rollout.agents import Agent, Observation
 
@@ -49,11 +49,14 @@ class RandomAgent(NoOpAgent):
 
 
 class ReplayAgent(NoOpAgent):
-    """Executes the actions of one demonstration, whatever it sees, and then stands still."""
+    """Executes the actions of one demonstration of the task, whatever it sees, and then stands still."""
 
     def __init__(self, task: Task, demonstrations: LeRobotDataset, episode: int):
         super().__init__(task)
-        row = demonstrations.meta.episodes[episode % demonstrations.num_episodes]
+        known = demonstrations.meta.episodes
+        names = known[TASK_NAME] if TASK_NAME in known.column_names else []
+        own = [number for number, name in enumerate(names) if name == task.name] or range(demonstrations.num_episodes)
+        row = known[own[episode % len(own)]]
         rows = range(row["dataset_from_index"], row["dataset_to_index"])
         column = demonstrations.hf_dataset.with_format("numpy")["dart.executed_action"]
         self.actions = np.asarray(column[list(rows)], dtype=np.float32)

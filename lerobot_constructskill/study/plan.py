@@ -1,6 +1,6 @@
 """From a study to its runs: all that a run depends on is read, checked and written out before anything runs."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
@@ -8,7 +8,7 @@ from typing import Any
 
 from lerobot.envs import EnvConfig
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import ANY_ACTION, TASK_ACTION, get_task
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
@@ -43,6 +43,7 @@ def list_runs(study: Study) -> list[Run]:
         with _inside(f"settings.{name}.env"):
             env = resolve_env(setting.env)
         sets = {data: _read_demonstrations(name, data) for data in study.data_of(name)}
+        _check_actions(name, env, sets.values())
         common = {"setting": name, "env": env, "validated_on": tuple(sets.values())}
         for reference, count in study.references.items():
             for draw in _draws(study, range(count), sets):
@@ -54,6 +55,17 @@ def list_runs(study: Study) -> list[Run]:
                 arm = _variant_arm(study, variant_name, variant, data, common | {"starts": draw.starts})
                 runs += [Run(arm, seed) for seed in draw.seeds]
     return runs
+
+
+def _check_actions(setting: str, env: Mapping[str, Any], sets: Iterable[NamedSet]) -> None:
+    """Refuse demonstrations whose actions are not those of the environment."""
+    acts_in = get_task(env["task"], env.get("action", TASK_ACTION)).action_names
+    for one in sets:
+        if (shown := one.node.config.rows[0].action_names) != acts_in:
+            raise InputError(
+                f"settings.{setting}: the actions of '{one.name}' are {shown}, those of its env {acts_in}: give both "
+                f"`action: {ANY_ACTION}`."
+            )
 
 
 @dataclass(frozen=True)

@@ -35,9 +35,7 @@ class Training:
 def held_out_of(dataset: "LeRobotDataset", every: int = HELD_OUT_EVERY) -> list[int]:
     """The held-out episodes of a data set or of its features; in a set of several tasks they are counted by task."""
     episodes = dataset.meta.episodes
-    return held_out(
-        episodes[TASK_NAME] if TASK_NAME in episodes.column_names else dataset.num_episodes, every
-    )
+    return held_out(episodes[TASK_NAME] if TASK_NAME in episodes.column_names else dataset.num_episodes, every)
 
 
 class _Holdout(TypedDict):

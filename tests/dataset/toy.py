@@ -6,7 +6,15 @@ The experts, the noise, the recorder and the video encoder are the real ones.
 import numpy as np
 import pytest
 
-from lerobot_constructskill.contract import IMAGE_SIZE, OBS_TYPES, PLURALS, REWARD_LIFTED, REWARD_PLACED, SIM_STATE
+from lerobot_constructskill.contract import (
+    IMAGE_SIZE,
+    OBS_TYPES,
+    PLURALS,
+    REWARD_LIFTED,
+    REWARD_PLACED,
+    SIM_STATE,
+    TASKS,
+)
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 
@@ -24,11 +32,12 @@ class ToyEnv:
 
     def __init__(self, task, obs_type, episode_length, light_robot=None, cameras=None, action="task"):
         self.cameras, self.episode_length = cameras or OBS_TYPES[obs_type], episode_length
+        self.offset = 0.001 * [*TASKS].index(task)
 
     def reset(self, seed):
         self.seed, self.steps, self.settled, self.lifted = seed, 0, 0, False
         self.tcp = np.array([0.0, 0.0, 0.17])
-        self.object = np.array([0.002 * (seed % 7), 0.0, 0.05])
+        self.object = np.array([0.002 * (seed % 7) + self.offset, 0.0, 0.05])
         self.grip = 1.0
         coarse = np.random.default_rng(seed).integers(0, 255, (8, 8, 3), dtype=np.uint8)
         self.background = coarse.repeat(IMAGE_SIZE // 8, axis=0).repeat(IMAGE_SIZE // 8, axis=1)
@@ -38,7 +47,7 @@ class ToyEnv:
         self.steps += 1
         self.tcp = self.tcp + RESPONSE * action[:3]
         held = self.grip < 0 and np.linalg.norm(self.tcp - self.object) < 0.06
-        self.grip = float(action[3])
+        self.grip = float(action[-1])
         if held and self.grip < 0:
             self.object = self.tcp - [0, 0, 0.02]
         elif held:
@@ -88,8 +97,8 @@ class ToyEnv:
         return {"pixels": dict.fromkeys(self.cameras, image)}
 
 
-def record_toy(root, episodes):
+def record_toy(root, episodes, **fields):
     """Record with the toy in place of this process's simulator."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "_environment", ToyEnv)
-        record(GenerateConfig("local/toy", str(root), episodes=episodes))
+        record(GenerateConfig("local/toy", str(root), episodes=episodes, **fields))

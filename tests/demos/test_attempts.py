@@ -11,14 +11,14 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_constructskill.artifacts import disk
-from lerobot_constructskill.contract import SIM_STATE
+from lerobot_constructskill.contract import SIM_STATE, SUITES
 from lerobot_constructskill.demos import merge, recorder, shards
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
-from lerobot_constructskill.demos.settings import frames_digest
-from lerobot_constructskill.demos.shards import Attempt
+from lerobot_constructskill.demos.settings import frames_digest, generator_facts
+from lerobot_constructskill.demos.shards import Attempt, Block
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError
 
@@ -46,11 +46,64 @@ def attempted(monkeypatch):
     return seeds
 
 
+def run_attempts(config, folder):
+    """The attempts at the only task, whose shards are in `folder`."""
+    block = Block(config, folder)
+    recorder._run_attempts(config, [block])
+    return block.attempts
+
+
 @pytest.mark.parametrize("workers", [1, 2, 3, 8])
 def test_the_first_successes_in_the_order_of_seeds_are_taken_whatever_the_workers(workers, attempted, tmp_path):
-    attempts = recorder._run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    attempts = run_attempts(replace(CONFIG, workers=workers), tmp_path)
     assert [attempt.seed for attempt in attempts] == sorted(attempted) == list(range(10))
     assert [attempt.seed for attempt in attempts if attempt.success] == [1, 2, 5, 6, 7, 9]
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3, 8])
+def test_the_attempts_of_each_of_several_tasks_are_those_of_the_task_alone(workers, attempted, tmp_path):
+    config = replace(CONFIG, task="bins", workers=workers)
+    blocks = [Block(part, tmp_path / part.task) for part in config.parts]
+    (tmp_path / "block_to_bin" / "3").mkdir(parents=True)
+    (tmp_path / "block_to_bin" / "3" / shards.OUTCOME).write_text(
+        json.dumps(asdict(Attempt(3, False, 9, True, "cpu")))
+    )
+    recorder._run_attempts(config, blocks)
+    assert [block.config.task for block in blocks] == [*SUITES["bins"]]
+    for block in blocks:
+        assert [attempt.seed for attempt in block.attempts] == list(range(10)) and block.discarded == [0, 3, 4, 8]
+    assert sorted(attempted) == sorted([*range(10), *range(10), *(seed for seed in range(10) if seed != 3)])
+
+
+def test_a_task_of_several_at_which_too_many_attempts_fail_ends_the_run(attempted, tmp_path):
+    config = replace(CONFIG, task="bins", max_failures=0.5)
+    with pytest.raises(InputError, match="4 attempts at brick_to_bin failed"):
+        recorder._run_attempts(config, [Block(part, tmp_path / part.task) for part in config.parts])
+
+
+def test_shards_of_a_task_serve_a_set_of_several():
+    """And what a set of one task is found by does not know of the choice."""
+    parts = replace(CONFIG, task="bins").parts
+    assert [frames_digest(part) for part in parts] == [
+        frames_digest(replace(CONFIG, task=task)) for task in SUITES["bins"]
+    ]
+    listed = replace(CONFIG, task=",".join(SUITES["bins"]))
+    assert generator_facts(listed) == generator_facts(replace(CONFIG, task="bins"))
+    assert not {"action", "cameras"} & generator_facts(CONFIG).keys()
+    assert Demonstrations(listed).digest != Demonstrations(replace(listed, action="full")).digest
+
+
+@pytest.mark.parametrize(
+    "task, said",
+    [
+        ("brick_to_bin,wall_of_ten", "Unknown task 'wall_of_ten'"),
+        ("bins,brick_to_bin", "names a task twice"),
+        ("brick_to_bin,brick_to_bin_turned", "action=full"),
+    ],
+)
+def test_tasks_that_no_set_can_have_are_refused(task, said):
+    with pytest.raises(InputError, match=said):
+        replace(CONFIG, task=task)
 
 
 @pytest.mark.parametrize("workers", [1, 3])
@@ -62,7 +115,7 @@ def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, at
         )
     (tmp_path / "5.partial" / "dataset").mkdir(parents=True)
     (tmp_path / "5.partial" / "dataset" / shards.OUTCOME).touch()
-    attempts = recorder._run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    attempts = run_attempts(replace(CONFIG, workers=workers), tmp_path)
     assert [attempt.seed for attempt in attempts] == list(range(10))
     assert sorted(attempted) == [0, 2, 3, 5, 6, 8, 9]
 
@@ -74,6 +127,7 @@ def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, at
         {"obs_type": "pixels_agent_pos"},
         {"max_steps": 999},
         {"light_robot": False},
+        {"action": "full"},
         {"labels": "executed"},
         {"video": "lossless"},
         {"expert": ExpertConfig(gain=0.9)},
@@ -118,14 +172,15 @@ def test_machines_that_draw_the_robot_differently_are_not_mixed(tmp_path):
         (Attempt(1, True, 10, True, "gpu"), "some"),
     ):
         with pytest.raises(ValueError, match=said):
-            merge.merge(CONFIG, [Attempt(0, True, 10, True, "cpu"), other], tmp_path, tmp_path / "set")
+            block = Block(CONFIG, tmp_path, [Attempt(0, True, 10, True, "cpu"), other])
+            merge.merge(CONFIG, [block], tmp_path / "set")
 
 
 @pytest.mark.parametrize("content", ["", "[]", "null", '{"seed": 1}'])
 def test_an_attempt_that_lost_its_content_is_run_again(content, attempted, tmp_path):
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / shards.OUTCOME).write_text(content)
-    attempts = recorder._run_attempts(CONFIG, tmp_path)
+    attempts = run_attempts(CONFIG, tmp_path)
     assert sorted(attempted) == [attempt.seed for attempt in attempts] == list(range(10))
     assert not (tmp_path / "1").exists()  # in the way of the new one
 
@@ -152,4 +207,4 @@ def test_a_disk_that_scratch_files_fill_is_measured_before_they_are_gone(tmp_pat
     monkeypatch.setattr(merge, "aggregate", aggregate)
     monkeypatch.setattr(disk.shutil, "disk_usage", usage)
     with pytest.raises(MachineError, match="is full"):
-        merge.merge(CONFIG, [Attempt(0, True, 10, True, "cpu")], tmp_path, tmp_path / "set")
+        merge.merge(CONFIG, [Block(CONFIG, tmp_path, [Attempt(0, True, 10, True, "cpu")])], tmp_path / "set")

@@ -91,3 +91,4 @@ def test_nothing_to_fit_is_told():
 
 def test_every_eighth_episode_is_held_out():
     assert held_out(80) == [7, 15, 23, 31, 39, 47, 55, 63, 71, 79] and held_out(7) == []
+    assert held_out([*"aabbab", *"b" * 4], 4) == [6] and held_out(["a"] * 9 + ["b"] * 9) == [7, 16]
