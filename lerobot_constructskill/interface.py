@@ -50,7 +50,7 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
     }
     return {
         "task": task.name,
-        "instruction": task.instruction,
+        **describe_instruction(task),
         "fps": FPS,
         "robot": {
             "name": "Franka Panda",
@@ -71,6 +71,11 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
         **({"state": state} if has_state else {}),
         "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
     }
+
+
+def describe_instruction(task: Task) -> dict[str, Any]:
+    """What a policy is told of `task`: its sentence, and others of the same meaning to train with."""
+    return {"instruction": task.instruction, "rewordings": [*next(iter(task.rewordings), ())]}
 
 
 def _describe_channel(name: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_constructskill.artifacts.digests import file_sha256, files_below
 from lerobot_constructskill.contract import CAMERAS, GRIPPER, ROTATION, STATE_NAMES, TRANSLATION, Task
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.interface import describe_task
+from lerobot_constructskill.interface import describe_instruction, describe_task
 
 MODALITY, CONTRACT = "meta/modality.json", "meta/contract.json"
 
@@ -31,8 +31,8 @@ def meaning(tasks: Sequence[Task], cameras: Iterable[str]) -> dict[str, Any]:
     contract = describe_task(tasks[0], cameras)
     if len(tasks) == 1:
         return contract
-    named = {"tasks": [{"task": task.name, "instruction": task.instruction} for task in tasks]}
-    return named | {name: value for name, value in contract.items() if name not in ("task", "instruction")}
+    named = [{"task": task.name, **describe_instruction(task)} for task in tasks]
+    return {"tasks": named} | {name: value for name, value in contract.items() if name not in named[0]}
 
 
 def modality(task: Task, cameras: Iterable[str]) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Writes a feature set: a LeRobotDataset through a frozen encoder, once."""
 
+import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +26,7 @@ from lerobot_constructskill.policies.frozen_vit.feature_sets import (
     feature_key,
     point_key,
 )
+from lerobot_constructskill.policies.frozen_vit.language import CONTRACT
 from lerobot_constructskill.policies.frozen_vit.precision import AUTO, check_native, resolve_precision
 from lerobot_constructskill.policies.frozen_vit.readouts import POINT_NAMES
 from lerobot_constructskill.policies.frozen_vit.weights import load_weights, state_sha256
@@ -225,6 +227,8 @@ def _write_copy(
     stats = compute_episode_stats({name: column.astype(np.float64) for name, column in columns.items()}, features)
     write_stats({**(copy.meta.stats or {}), **stats}, folder)
     _forget_videos(folder)
+    if (contract := dataset.root / CONTRACT).is_file():
+        shutil.copyfile(contract, folder / CONTRACT)
     if patches:
         _join_files(patches, dataset.num_frames, folder / PATCHES_FILE)
         bind_patches(folder)

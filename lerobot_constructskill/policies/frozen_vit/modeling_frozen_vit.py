@@ -326,7 +326,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         if self.told:
             if "task" not in batch:
                 raise InputError("frozen_vit was trained with instructions, and the batch has no task.")
-            beside.append(self.told(batch["task"]))
+            sentences = batch["task"]
+            if self.training and "index" in batch:
+                sentences = self.told.reworded(sentences, batch["index"].tolist())
+            beside.append(self.told(sentences))
         return (pooled, torch.cat(beside, dim=-1)) if beside else (pooled,)
 
     def _raw_chunk(self, batch: dict[str, Tensor]) -> Tensor:

@@ -25,6 +25,7 @@ from .batches import Rows
 from .configuration_frozen_vit import FrozenViTChunkConfig
 from .feature_sets import open_patches
 from .heads import ChunkHeads, heads_loss
+from .language import Told
 from .modeling_frozen_vit import FrozenViTChunkPolicy
 
 
@@ -111,12 +112,20 @@ def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tupl
     """Return what the heads see of every row; patch features that a readout learns from stay on the disk."""
     beside = [table[OBS_STATE]] if policy.config.use_state else []
     if policy.told:
-        beside.append(policy.told(policy.config.sentences)[table["task_index"]])
+        beside.append(_told(policy.told, policy.config.sentences, table))
     side = (torch.cat(beside, dim=-1),) if beside else ()
     if policy.readout.learns:
         return open_patches(policy.patches_root), *side
     pooled = [policy.pooled(rows) for rows in _split(table)]
     return torch.cat(pooled), *side
+
+
+def _told(told: Told, sentences: Sequence[Sequence[str]], table: dict[str, Tensor]) -> Tensor:
+    """The vectors of what every row is told, (N, D)."""
+    asked = [sentences[number][0] for number in table["task_index"].tolist()]
+    reworded = told.reworded(asked, table["index"].tolist())
+    known = {sentence: place for place, sentence in enumerate(dict.fromkeys(reworded))}
+    return told([*known])[[known[sentence] for sentence in reworded]]
 
 
 def _split(table: dict[str, Tensor], size: int = 256) -> Iterator[dict[str, Tensor]]:
