@@ -29,7 +29,10 @@ NAMES = {
     "load_info": "lerobot.datasets.io_utils",
     "load_stats": "lerobot.datasets.io_utils",
     "RunningQuantileStats": "lerobot.datasets.compute_stats",
+    "write_table_one_row_group_per_episode": "lerobot.datasets.io_utils",
     "write_video": "lerobot.utils.io_utils",
+    # How a loader batches frames that hold annotations.
+    "lerobot_collate_fn": "lerobot.utils.collate",
     # Where LeRobot keeps data sets, its own and those from the Hub.
     "HF_LEROBOT_HOME": "lerobot.utils.constants",
     "HF_LEROBOT_HUB_CACHE": "lerobot.utils.constants",

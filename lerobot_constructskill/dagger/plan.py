@@ -42,6 +42,8 @@ class Plan:
     def __post_init__(self):
         if len(self.base.config.rows) > 1:
             raise InputError(f"DAgger's rounds are of one task; the base has several, {self.base.config.task}.")
+        if self.base.config.annotate:
+            raise InputError("The base has language columns, which rounds have not: generate it without annotate.")
         if self.base.config.labels == "executed":
             raise InputError("The base has executed actions as labels; DAgger needs the expert's.")
         check_apart({"demonstrations": self.base.starts, "rounds": self.config.starts})

@@ -19,7 +19,7 @@ from lerobot_constructskill.contract import (
     select_tasks,
 )
 from lerobot_constructskill.dataset.dataset import DataSet, Provenance
-from lerobot_constructskill.demos.columns import SIDECAR, as_made, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import LANGUAGE, SIDECAR, as_made, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.settings import generator_facts
 from lerobot_constructskill.errors import InputError
@@ -51,6 +51,8 @@ MEANINGS = {
     "sim.finger_forces": "privileged: net contact force on each finger, N, world frame",
     "sim.object_forces": "privileged: largest contact force between each object and another body, N",
     "sim.seed": "seed of the episode's initial state and noise",
+    "language_persistent": "the expert's subtasks, each from its first frame on, and other words for the task",
+    "language_events": "none",
     "dagger.round": "the round in which the frame came about, 0 for demonstrations",
     "dagger.actor": "whose action was executed: the expert's (in demonstrations with noise) or the learner's",
     "dagger.hopeless": "whether the expert knows no way to success from here; it then opens, rises and waits",
@@ -133,6 +135,7 @@ def render(facts: dict[str, Any]) -> str:
     columns = dagger_features if "dagger" in facts else demonstration_features
     seen = generator.get("cameras") or OBS_TYPES[generator["obs_type"]]
     features = as_made(columns(tasks[0], seen), bool(facts.get("joints")), bool(facts.get("placements")))
+    features |= LANGUAGE if generator.get("annotate") else {}
     cameras = [CAMERAS[name] for name in seen]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
     return render_template(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import (
@@ -25,8 +26,9 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.dataset.dataset import DataSet, Provenance, TaskBlock
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
-from lerobot_constructskill.demos.columns import ACTORS, EXPERT, SIDECAR
+from lerobot_constructskill.demos.columns import ACTORS, EVENTS, EXPERT, PERSISTENT, SIDECAR
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
+from lerobot_constructskill.demos.language import said_of
 from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.metadata import MODALITY, file_hashes
 from lerobot_constructskill.demos.noise import execute
@@ -222,6 +224,33 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
     )
 
 
+def check_language(data: DataSet) -> Iterator[str]:
+    """The annotations are those of the phases, in every frame."""
+    if not data.config.annotate:
+        return
+    names = ["episode_index", "phase", "sim.placement", "timestamp"]
+    tasks = [data.task_of(episode) for episode in range(len(data.episodes))]
+    wanted = said_of(pa.Table.from_pandas(data.rows[names]), tasks)
+    found = data.rows[PERSISTENT]
+    wrong = [not _is_said(*both) for both in zip(found, wanted, strict=True)]
+    events = data.rows[EVENTS].map(len).to_numpy() > 0
+    yield from _found(
+        {
+            f"{PERSISTENT} is not what the phases say in {plural(sum(wrong), 'frame')}.": any(wrong),
+            f"{EVENTS} has rows in {plural(events.sum(), 'frame')}, which no expert wrote.": events.any(),
+        }
+    )
+
+
+def _is_said(found, wanted: list[dict[str, Any]]) -> bool:
+    """Whether a frame's annotations are those of its episode."""
+    return len(found) == len(wanted) and all(
+        one["timestamp"] == np.float32(other["timestamp"])
+        and all(one[name] == other[name] for name in ("role", "content", "style"))
+        for one, other in zip(found, wanted, strict=True)
+    )
+
+
 def check_timestamps(data: DataSet) -> Iterator[str]:
     off = np.abs(data.column("timestamp") - data.column("frame_index") / FPS)
     if off.max() > 1e-4:
@@ -368,6 +397,7 @@ CHECKS: dict[str, Check] = {
     "Noise": check_noise,
     "Episodes": check_episodes,
     "Time stamps": check_timestamps,
+    "Language": check_language,
     **FRAME_CHECKS,
     "Duplicates": check_duplicates,
     "Hold-out": check_hold_out,

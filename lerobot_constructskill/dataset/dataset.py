@@ -14,6 +14,7 @@ from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
 from lerobot_constructskill.contract import FPS, Task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
+    LANGUAGE,
     PLACEMENT_COLUMNS,
     SIDECAR,
     as_made,
@@ -181,7 +182,7 @@ class DataSet:
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
         features = made(self.config.rows[0], self.config.seen)
-        return as_made(features, self.has_joints, self.has_placements)
+        return as_made(features, self.has_joints, self.has_placements) | (LANGUAGE if self.config.annotate else {})
 
     @property
     def has_joints(self) -> bool:

@@ -34,6 +34,12 @@ PLACEMENT_COLUMNS = tuple(
 """Columns that data sets lack which were made before a task was a list of placements."""
 
 
+LANGUAGE = dict.fromkeys(
+    (PERSISTENT := "language_persistent", EVENTS := "language_events"),
+    {"dtype": "language", "shape": (1,), "names": None},
+)
+"""LeRobot's columns of annotations, in sets that were made with `annotate`."""
+
 VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
 """The column of a camera."""
 

@@ -12,6 +12,7 @@ from lerobot_constructskill.artifacts.digests import files_below
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.contract import TASK_NAME
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.language import annotate
 from lerobot_constructskill.demos.metadata import file_hashes, write_meanings
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, generator_facts
 from lerobot_constructskill.demos.shards import Block
@@ -47,6 +48,8 @@ def merge(config: GenerateConfig, blocks: list[Block], folder: Path) -> None:
     with tempfile.TemporaryDirectory(dir=blocks[0].shards) as scratch, room_for(folder):
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
+    if config.annotate:
+        annotate(folder, [row for row, block in zip(config.rows, blocks, strict=True) for _ in block.demonstrations])
     write_meanings(folder, config.rows, config.seen)
     of_tasks = {}
     if len(blocks) > 1:
@@ -132,7 +135,7 @@ def frame_statistics(folder: Path) -> dict[str, dict[str, np.ndarray]]:
     features = load_info(folder).features
     statistics = {}
     for name, feature in features.items():
-        if feature["dtype"] in ("string", "image", "video"):
+        if feature["dtype"] in ("string", "image", "video", "language"):
             continue
         paths = (path for path in files_below(folder, "data") if path.suffix == ".parquet")
         column = np.concatenate([np.stack(read_parquet(path, [name]).to_pandas()[name]) for path in paths])

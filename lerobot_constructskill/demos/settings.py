@@ -49,6 +49,8 @@ class GenerateConfig:
             expert has finished: its last steps, the open hand above the bin, show when to let go.
         action: the channels of `action`: those of the `task`, or `full`, which tasks with and without rotations share;
             those that a task does not use are 0.
+        annotate: whether LeRobot's language columns are written: the expert's subtasks, to the frame, and other words
+            for the task.
         expert: its gains, thresholds and dwells (metres, steps).
         noise: what is added to the executed action (metres).
         workers: attempts that run at the same time; the data set does not depend on it.
@@ -73,6 +75,7 @@ class GenerateConfig:
     video: Annotated[str, Among(tuple(VIDEOS))] = "av1"
     stop_at_success: bool = True
     action: Annotated[str, Among(ACTIONS)] = TASK_ACTION
+    annotate: bool = False
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     workers: Workers = 1
@@ -131,7 +134,7 @@ def generator_facts(config: GenerateConfig) -> dict[str, Any]:
     facts = {name: value for name, value in asdict(config).items() if name not in ("root", "workers", "executor")}
     facts["task"] = ",".join(row.name for row in config.rows)  # a suite may get others
     # What is not asked for is left out, so that sets from before there was a choice keep their digests.
-    left_out = {"cameras": not config.cameras, "action": config.action == TASK_ACTION}
+    left_out = {"cameras": not config.cameras, "action": config.action == TASK_ACTION, "annotate": not config.annotate}
     return {name: value for name, value in facts.items() if not left_out.get(name)}
 
 
@@ -140,7 +143,7 @@ def frames_digest(config: GenerateConfig) -> str:
 
     The renderer is left out, because it is known only once a shard exists; `merge` refuses a mixture of renderers.
     """
-    others = ("repo_id", "episodes", "max_failures", "seed_start")
+    others = ("repo_id", "episodes", "max_failures", "seed_start", "annotate")
     facts = {name: value for name, value in generator_facts(config).items() if name not in others}
     return digest(facts | frame_facts(config) | {"versions": frame_versions(config)})
 

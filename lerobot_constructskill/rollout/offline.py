@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader, Subset
 
 from lerobot_constructskill.contract import GRIPPER, TRANSLATION
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.lerobot_internals import lerobot_collate_fn
 from lerobot_constructskill.progress import Progress
 from lerobot_constructskill.rollout.agents import PolicyAgent, observing
 
@@ -147,7 +148,8 @@ def predict(agent: PolicyAgent, dataset: LeRobotDataset, frames: Sequence[int], 
         batch_size: frames at a time.
     """
     agent.policy.reset()
-    asked = [_ask(agent, batch) for batch in DataLoader(Subset(dataset, frames), batch_size)]
+    loader = DataLoader(Subset(dataset, frames), batch_size, collate_fn=lerobot_collate_fn)
+    asked = [_ask(agent, batch) for batch in loader]
     return Predictions(*(torch.cat(parts).float().cpu().numpy() for parts in zip(*asked, strict=True)))
 
 

@@ -4,9 +4,11 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from lerobot.datasets import LeRobotDataset
+from torch.utils.data import DataLoader
 from toy import record_toy
 
 from lerobot_constructskill.contract import DEMO_SEED_START, SUITES, TASK_NAME, TASKS
@@ -15,7 +17,11 @@ from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.split import split_of
 from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.demos.language import SUBTASKS, objects_of, persistent_rows, rewordings
 from lerobot_constructskill.demos.metadata import CONTRACT
+from lerobot_constructskill.features.encode import _write_copy
+from lerobot_constructskill.lerobot_internals import lerobot_collate_fn
+from lerobot_constructskill.policies.frozen_vit.feature_sets import feature_key
 from lerobot_constructskill.rollout.references import ReplayAgent
 from lerobot_constructskill.training.recipe import held_out_of
 
@@ -27,7 +33,7 @@ NAMES = [task for task in SUITES["bins"] for _ in range(3)]
 def pristine(tmp_path_factory):
     """Three demonstrations of each of three tasks, of which two have one instruction; one attempt at each fails."""
     root = tmp_path_factory.mktemp("many") / "set"
-    record_toy(root, 3, task="bins", action="full")
+    record_toy(root, 3, task="bins", action="full", annotate=True)
     return root
 
 
@@ -75,6 +81,47 @@ def test_the_card_and_the_contract_name_every_task(pristine):
     assert [task["task"] for task in said["tasks"]] == [*SUITES["bins"]] and len(said["action"]["channels"]) == 7
 
 
+def test_lerobot_reads_the_subtask_of_each_frame_and_other_words_for_the_task(pristine):
+    """By its own resolver: the active subtask is that of the frame's phase, from the phase's first frame on."""
+    from lerobot.datasets.language_render import active_at
+
+    dataset = LeRobotDataset("local/toy", root=pristine)
+    assert dataset.meta.has_language_columns
+    block = dataset.meta.episodes[6]
+    for index in range(block["dataset_from_index"], block["dataset_to_index"]):
+        frame = dataset[index]
+        held = active_at(float(frame["timestamp"]), persistent=frame["language_persistent"], style="subtask")
+        assert held["content"] == SUBTASKS[frame["phase"]].format("concrete block") and frame["language_events"] == []
+    words = [row["content"] for row in frame["language_persistent"] if row["style"] == "task_aug"]
+    assert words == rewordings(frame["task"]) and words[0] == frame["task"] and len({*words}) == len(words) > 3
+    batch = next(iter(DataLoader(dataset, 4, collate_fn=lerobot_collate_fn)))
+    assert batch["action"].shape == (4, 7)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_task_has_other_words_and_names_its_objects(task):
+    assert len(rewordings(TASKS[task].instruction)) > 1
+    assert "object" not in objects_of(TASKS[task]) and len({*objects_of(TASKS[task])}) == len(objects_of(TASKS[task]))
+
+
+def test_a_subtask_of_a_wall_names_the_element_that_the_expert_has_in_hand():
+    phases = [*(["PREGRASP"] * 2), "GRASP", *(["RELEASE"] * 2), *(["PREGRASP"] * 2)]
+    rows = persistent_rows(TASKS["lintel_on_posts"], phases, [0, 0, 0, 0, 1, 1, 1], np.arange(7) / 20)
+    assert [(row["content"], round(20 * row["timestamp"])) for row in rows if row["style"] == "subtask"] == [
+        ("Move the open gripper above the post 1.", 0),
+        ("Close the gripper on the post 1.", 2),
+        ("Set the post 1 down and let go.", 3),
+        ("Move the open gripper above the post 2.", 5),
+    ]
+
+
+def test_a_feature_set_says_of_which_task_its_episodes_are(pristine, tmp_path):
+    dataset = LeRobotDataset("local/toy", root=pristine)
+    column = np.zeros((dataset.num_frames, 2), np.float32)
+    _write_copy(dataset, "base", {feature_key("base"): column}, [], {}, "local/features", tmp_path / "set")
+    assert held_out_of(LeRobotDataset("local/features", root=tmp_path / "set"), 2) == [1, 4, 7]
+
+
 def episodes(change):
     def corrupt(root):
         for path in (root / "meta/episodes").rglob("*.parquet"):
@@ -114,6 +161,15 @@ DAMAGES = {
         rows(lambda table: table.assign(task_index=table["task_index"].where(table["index"] != 5, 1))),
         "Episodes",
         "another instruction than the episode's in 1 frame",
+    ),
+    "another subtask": (
+        rows(
+            lambda table: table.assign(
+                phase=table["phase"].where(table["frame_index"] != (table["phase"] == "LIFT").argmax(), "GRASP")
+            )
+        ),
+        "Language",
+        "not what the phases say",
     ),
     "no attempts": (made(lambda facts: facts.pop("tasks")), "Provenance", "does not say in tasks"),
     "other attempts": (
