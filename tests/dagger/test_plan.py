@@ -38,6 +38,17 @@ def test_names_places_and_how_it_is_run_change_nothing(fields):
     assert made(**fields) == made()
 
 
+def test_the_action_of_the_base_is_that_of_the_rounds():
+    assert Plan.of(replace(CONFIG, base=f"{SEEN} --action=full")).env["action"] == "full"
+    assert "action" not in Plan.of(CONFIG).env
+
+
+@pytest.mark.parametrize("flag, said", [("--task=bins", "rounds are of one task"), ("--annotate=true", "language")])
+def test_a_base_that_no_round_is_like_is_refused(flag, said):
+    with pytest.raises(InputError, match=said):
+        Plan.of(replace(CONFIG, base=f"{SEEN} {flag}"))
+
+
 def test_more_rounds_go_on_where_fewer_ended():
     assert Plan.of(replace(CONFIG, rounds=9)).checkpoint(3).digest == made()[0][3]
 

@@ -118,6 +118,14 @@ def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
     assert validated("fixed/own/seed_1,fixed/more") == {one for one in fixed if most not in one and "most" not in one}
 
 
+def test_demonstrations_and_environment_have_one_action():
+    with pytest.raises(InputError, match="settings.fixed: the actions of 'smoke --action=full' are .*`action: full`"):
+        list_runs(study(settings={"fixed": Setting("smoke --action=full", ENV)}))
+    many = Setting("smoke --task=bins,brick_to_bin_turned --action=full", ENV | {"action": "full"})
+    assert {run.arm.env["action"] for run in list_runs(study(settings={"fixed": many}))} == {"full"}
+    assert not any("action" in run.arm.env for run in list_runs(study()))
+
+
 def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
     policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
     variants = {
