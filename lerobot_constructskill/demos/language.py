@@ -34,21 +34,6 @@ SUBTASKS = {
 OBJECTS = "concrete block|ceiling tile|timber post|brick|block|tile|post|beam"
 """What an instruction may call its object; the first that it names is meant."""
 
-SYNONYMS = {
-    "Pick up": ("Grasp", "Take hold of"),
-    "pick it up": ("grasp it", "take hold of it"),
-    "Take": ("Grasp", "Pick up"),
-    "place it": ("put it", "set it down"),
-    "set it down": ("place it", "put it down"),
-    "set it flush": ("place it flush", "put it flush"),
-    "set its": ("fit its", "insert its"),
-    "Lay": ("Place", "Put down"),
-    "lay": ("place", "put"),
-    "Set up": ("Stand up", "Put up"),
-    "Build": ("Put up", "Lay"),
-}
-"""Phrases of instructions, and others that mean the same."""
-
 ROW = pa.struct(
     [
         ("role", pa.string()),
@@ -62,17 +47,6 @@ ROW = pa.struct(
 """A row of `language_persistent`; one of `language_events`, of which there are none, has no time stamp."""
 
 EVENT = pa.struct([field for field in ROW if field.name != "timestamp"])
-
-
-def rewordings(instruction: str) -> list[str]:
-    """The instruction, and sentences that differ from it in one phrase each."""
-    found = [
-        re.sub(rf"\b{phrase}\b", other, instruction, count=1)
-        for phrase, others in SYNONYMS.items()
-        if re.search(rf"\b{phrase}\b", instruction)
-        for other in others
-    ]
-    return [instruction, *found]
 
 
 def objects_of(task: Task) -> list[str]:
@@ -94,7 +68,8 @@ def persistent_rows(
         phases, placements, times: the columns `phase`, `sim.placement` and `timestamp` of its frames.
     """
     objects, starts = objects_of(task), [0, *(np.flatnonzero(np.array(phases[1:]) != np.array(phases[:-1])) + 1)]
-    rows = [_row("user", words, "task_aug", times[0]) for words in rewordings(task.instruction)]
+    told = [task.instruction, *next(iter(task.rewordings), ())]
+    rows = [_row("user", words, "task_aug", times[0]) for words in told]
     for start, stop in zip(starts, [*starts[1:], len(phases)], strict=True):
         # An object counts as placed while the hand still opens, and the one before may do so until after that.
         number = int(placements[start if phases[start] == Phase.RELEASE else stop - 1])

@@ -17,7 +17,7 @@ from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.split import split_of
 from lerobot_constructskill.demos.columns import SIDECAR
-from lerobot_constructskill.demos.language import SUBTASKS, objects_of, persistent_rows, rewordings
+from lerobot_constructskill.demos.language import SUBTASKS, objects_of, persistent_rows
 from lerobot_constructskill.demos.metadata import CONTRACT
 from lerobot_constructskill.features.encode import _write_copy
 from lerobot_constructskill.lerobot_internals import lerobot_collate_fn
@@ -93,14 +93,13 @@ def test_lerobot_reads_the_subtask_of_each_frame_and_other_words_for_the_task(pr
         held = active_at(float(frame["timestamp"]), persistent=frame["language_persistent"], style="subtask")
         assert held["content"] == SUBTASKS[frame["phase"]].format("concrete block") and frame["language_events"] == []
     words = [row["content"] for row in frame["language_persistent"] if row["style"] == "task_aug"]
-    assert words == rewordings(frame["task"]) and words[0] == frame["task"] and len({*words}) == len(words) > 3
+    assert words == [frame["task"], *TASKS["block_to_bin"].rewordings[0]]
     batch = next(iter(DataLoader(dataset, 4, collate_fn=lerobot_collate_fn)))
     assert batch["action"].shape == (4, 7)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_task_has_other_words_and_names_its_objects(task):
-    assert len(rewordings(TASKS[task].instruction)) > 1
+def test_every_task_names_its_objects(task):
     assert "object" not in objects_of(TASKS[task]) and len({*objects_of(TASKS[task])}) == len(objects_of(TASKS[task]))
 
 
