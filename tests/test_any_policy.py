@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 from commands import QUICK, call
 from tokenizers import Tokenizer
 from tokenizers.models import WordLevel
@@ -14,10 +15,13 @@ from tokenizers.pre_tokenizers import Whitespace
 from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
 from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import ORDERS, get_task
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
+from lerobot_constructskill.parsing import read_fields
+from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.config import ConfigConfig, write
 from lerobot_constructskill.scripts.held_out import OfflineConfig, evaluate_offline
+from lerobot_constructskill.study.rows import ROWS, read_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.nightly]
 
@@ -135,3 +139,23 @@ def test_a_policy_is_evaluated_offline(trained, demonstrations):
     assert (row["policy"], row["training_seed"]) == (kind, 1000)
     assert 0.001 < row["mean_m"] <= row["rmse_m"] < 0.3 and 0 < row["consistency_m"] < 0.3
     assert 0 <= row["gripper_accuracy"] <= 1 and 0 <= row["gripper_change_accuracy"] <= 1
+
+
+def test_the_study_of_vlas_runs_whole(smolvla_base, folder):
+    """With a tiny SmolVLA of random weights on a CPU, one seed, few steps and short episodes."""
+    fields = read_fields(find("study", "vla"))
+    vla = fields["variants"]["smolvla"]
+    vla["policy"] |= {"device": "cpu", "pretrained_path": str(smolvla_base), "num_steps": 2}
+    fields["variants"] = {"smolvla": vla | {"seeds": 1, "training": {"epochs": 1}}}
+    fields["analysis"]["labels"].pop("told")
+    few = "suite/orders --episodes=1 --video=av1"
+    fields["settings"] = {
+        name: {"data": few, "env": setting["env"] | {"episode_length": 4}}
+        for name, setting in fields["settings"].items()
+    }
+    file = folder / "vla.yaml"
+    file.write_text(yaml.safe_dump(fields | {"episodes": 1, "training": {"batch_size": 256}, "references": {}}))
+    call("constructskill-study", str(file), f"--root={folder / 'vla'}", f"--store={folder / 'store'}")
+    rows = read_rows(folder / "vla" / ROWS)
+    assert rows["error"].isna().all() and sorted(rows["setting"]) == sorted(ORDERS)
+    assert len({*rows["weights_sha256"]}) == 1, "one policy for all four"

@@ -19,7 +19,7 @@ from metadata import write_metadata
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill import presets
 from lerobot_constructskill.board.protocol import BOARD_SUITES
-from lerobot_constructskill.contract import CAMERAS, FPS, get_task, held_out
+from lerobot_constructskill.contract import CAMERAS, FPS, TASKS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
@@ -35,7 +35,8 @@ from lerobot_constructskill.training.recipe import Training
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 GENERATE = sorted((CONFIGS / "generate").glob("*.yaml"))
-SUITE = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
+SETS = sorted((CONFIGS / "generate" / "suite").glob("*.yaml"))
+SUITE, MANY = ([path for path in SETS if (path.stem in TASKS) == is_one] for is_one in (True, False))
 PRECISE = sorted((CONFIGS / "generate" / "precise").glob("*.yaml"))
 POLICIES = sorted((CONFIGS / "policy").glob("*.yaml"))
 STUDIES = sorted((CONFIGS / "study").glob("*.yaml"))
@@ -58,6 +59,12 @@ def test_generation_configs_are_the_papers(path):
 def test_a_suites_set_is_the_everyday_set_of_its_task(path):
     everyday = generate_config(CONFIGS / "generate" / "fast_wrist.yaml")
     assert generate_config(path) == replace(everyday, task=path.stem)
+
+
+@pytest.mark.parametrize("path", MANY, ids=lambda path: path.stem)
+def test_a_set_of_many_tasks_has_forty_of_each_and_no_loss(path):
+    config = generate_config(path)
+    assert (len(config.rows), config.episodes, config.video) == ({"orders": 4, "all": 12}[path.stem], 40, "lossless")
 
 
 @pytest.mark.parametrize("path", PRECISE, ids=lambda path: path.stem)
@@ -86,7 +93,8 @@ def test_executed_labels_differ_from_fast_in_the_labels_alone():
 def test_a_study_is_runs_that_can_be_made(path):
     """Every field of it is one that something has, and policies are evaluated in the task that they learn."""
     for run in list_runs(parse(StudyConfig, [], path).study):
-        assert all(run.arm.env["task"] == data.node.config.task for data in run.arm.validated_on)
+        learnt = [[task.name for task in data.node.config.rows] for data in run.arm.validated_on]
+        assert all(run.arm.env["task"] in names for names in learnt)
 
 
 @pytest.mark.parametrize("name", ["perturbed", "perturbed_paper"])
