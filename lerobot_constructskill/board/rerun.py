@@ -8,7 +8,7 @@ import yaml
 from lerobot_constructskill.analysis.stats.comparisons import holm, mean_p_value
 from lerobot_constructskill.board.protocol import RERUN_ALPHA, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
-from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.contract import ANY_ACTION, OBS_TYPES
 from lerobot_constructskill.errors import InputError
 
 
@@ -25,10 +25,11 @@ def instructions(submission: Submission, value: str) -> str:
     declaration = submission.declaration
     first = fresh_start(submission.sha256, value)
     settings = fresh_settings(declaration.settings, first)
+    acting = f" --env.action={ANY_ACTION}" if ANY_ACTION in {claim.action for claim in submission.claims} else ""
     flags = [" ".join(f"--env.{name}='{one}'" for name, one in own.environment.items()) for own in settings.values()]
     commands = [
         "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
-        f"{env} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} --eval.batch_size=1 "
+        f"{env}{acting} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} --eval.batch_size=1 "
         f"--seed={first}"
         for env, setting in zip(flags, settings.values(), strict=True)
     ]

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import (
     CAMERAS,
     DEMO_SEED_START,
@@ -18,7 +17,7 @@ from lerobot_constructskill.contract import (
     held_out,
     select_tasks,
 )
-from lerobot_constructskill.dataset.dataset import DataSet, Provenance
+from lerobot_constructskill.dataset.dataset import DataSet, check_provenance_fields
 from lerobot_constructskill.demos.columns import LANGUAGE, SIDECAR, as_made, dagger_features, demonstration_features
 from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.settings import generator_facts
@@ -80,7 +79,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
     Raises:
         InputError: a field of the data set's metadata has an impossible value.
     """
-    check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+    check_provenance_fields(data.facts)
     if np.shape(covariance := data.facts["noise_covariance"]) != (3, 3):
         raise InputError(f"{SIDECAR}: noise_covariance must be 3 x 3, not {covariance}.")
     if unknown := {str(phase) for phase in data.column("phase")} - {str(phase) for phase in Phase}:

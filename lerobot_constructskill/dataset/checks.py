@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from lerobot_constructskill.bounds import check_fields
 from lerobot_constructskill.contract import (
     ACTION_SCALE,
     DEMO_SEED_START,
@@ -24,11 +22,11 @@ from lerobot_constructskill.contract import (
     TASK_NAME,
     TRANSLATION,
 )
-from lerobot_constructskill.dataset.dataset import DataSet, Provenance, TaskBlock
+from lerobot_constructskill.dataset.dataset import DataSet, TaskBlock, check_provenance_fields
 from lerobot_constructskill.dataset.frames import FRAME_CHECKS
-from lerobot_constructskill.demos.columns import ACTORS, EVENTS, EXPERT, PERSISTENT, SIDECAR
+from lerobot_constructskill.dataset.language import check_language
+from lerobot_constructskill.demos.columns import ACTORS, EXPERT
 from lerobot_constructskill.demos.expert import Phase, PrivilegedState, make_expert
-from lerobot_constructskill.demos.language import said_of
 from lerobot_constructskill.demos.merge import frame_statistics
 from lerobot_constructskill.demos.metadata import MODALITY, file_hashes
 from lerobot_constructskill.demos.noise import execute
@@ -64,7 +62,7 @@ def check_files(data: DataSet) -> Iterator[str]:
 
 def check_schema(data: DataSet) -> Iterator[str]:
     try:
-        check_fields(Provenance, data.facts, f"{SIDECAR}: ")
+        check_provenance_fields(data.facts)
     except InputError as error:
         yield str(error)
     features, wanted = data.info["features"], json.loads(json.dumps(data.columns))
@@ -195,9 +193,9 @@ def check_episodes(data: DataSet) -> Iterator[str]:
 def _check_tasks(data: DataSet) -> Iterator[str]:
     """Every frame has its task's instruction, and in a set of several tasks every episode its task's name."""
     instructions = _instructions(data)
-    wanted = np.array([instructions.index(data.task_of(episode).instruction) for episode in range(len(data.episodes))])
-    episodes = np.clip(data.column("episode_index"), 0, len(wanted) - 1)
-    other = data.column("task_index") != wanted[episodes]
+    episodes, place = np.unique(data.column("episode_index"), return_inverse=True)
+    wanted = np.array([instructions.index(data.task_of(episode).instruction) for episode in episodes])
+    other = data.column("task_index") != wanted[place]
     said = f"task_index is of another instruction than the episode's in {plural(other.sum(), 'frame')}."
     named, is_one = data.episodes.get(TASK_NAME), len(data.blocks) == 1
     is_named = named is None if is_one else named is not None and named.tolist() == data.task_names
@@ -221,33 +219,6 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
             and list(dict.fromkeys(phases)) != list(Phase),
             f"{who} does not end in success.": not is_round and not success[-1],
         }
-    )
-
-
-def check_language(data: DataSet) -> Iterator[str]:
-    """The annotations are those of the phases, in every frame."""
-    if not data.config.annotate:
-        return
-    names = ["episode_index", "phase", "sim.placement", "timestamp"]
-    tasks = [data.task_of(episode) for episode in range(len(data.episodes))]
-    wanted = said_of(pa.Table.from_pandas(data.rows[names]), tasks)
-    found = data.rows[PERSISTENT]
-    wrong = [not _is_said(*both) for both in zip(found, wanted, strict=True)]
-    events = data.rows[EVENTS].map(len).to_numpy() > 0
-    yield from _found(
-        {
-            f"{PERSISTENT} is not what the phases say in {plural(sum(wrong), 'frame')}.": any(wrong),
-            f"{EVENTS} has rows in {plural(events.sum(), 'frame')}, which no expert wrote.": events.any(),
-        }
-    )
-
-
-def _is_said(found, wanted: list[dict[str, Any]]) -> bool:
-    """Whether a frame's annotations are those of its episode."""
-    return len(found) == len(wanted) and all(
-        one["timestamp"] == np.float32(other["timestamp"])
-        and all(one[name] == other[name] for name in ("role", "content", "style"))
-        for one, other in zip(found, wanted, strict=True)
     )
 
 
@@ -323,11 +294,10 @@ def check_provenance(data: DataSet) -> Iterator[str]:
 
 
 def _check_attempts(data: DataSet, block: TaskBlock) -> Iterator[str]:
-    starts = [data.spans()[episode].start for episode in block.episodes if episode < len(data.spans())]
-    seeds = [int(seed) for seed in data.column("sim.seed")[starts][data.rounds[starts] == 0]]
-    attempts, of = range(data.config.seed_start, data.config.seed_start + block.attempts), ""
-    if len(data.blocks) > 1:
-        of = f" of {block.task.name}"
+    starts = [span.start for span in data.spans()[block.episodes.start : block.episodes.stop]]
+    seeds = data.column("sim.seed")[starts][data.rounds[starts] == 0].tolist()
+    attempts = range(data.config.seed_start, data.config.seed_start + block.attempts)
+    of = f" of {block.task.name}" if len(data.blocks) > 1 else ""
     yield from _found(
         {
             f"The seeds of the episodes{of} and the discarded ones are not those of the attempts, one by one.": (

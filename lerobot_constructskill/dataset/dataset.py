@@ -4,13 +4,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.bounds import Count, Pattern, Seed, Word
+from lerobot_constructskill.bounds import Count, Pattern, Seed, Word, check_fields
 from lerobot_constructskill.contract import FPS, Task
 from lerobot_constructskill.demos.columns import (
     JOINT_COLUMNS,
@@ -82,6 +83,17 @@ class Provenance(TypedDict):
 
 
 PROVENANCE = Json("the record of how a data set was made", Provenance)
+
+
+def check_provenance_fields(facts: Provenance) -> None:
+    """Refuse a record whose fields are out of their bounds.
+
+    Raises:
+        InputError: the message names the field.
+    """
+    check_fields(Provenance, facts, f"{SIDECAR}: ")
+    for name, tried in facts.get("tasks", {}).items():
+        check_fields(Tried, tried, f"{SIDECAR}: tasks.{name[:60]!a}.")
 
 
 @dataclass(frozen=True)
@@ -161,8 +173,8 @@ class DataSet:
         if [*told.get("tasks", {})] != [row.name for row in rows]:
             raise InputError(f"{SIDECAR} does not say in tasks what was attempted of each of {self.config.task}.")
         return [
-            TaskBlock(row, range(number * each, (number + 1) * each), **told["tasks"][row.name])
-            for number, row in enumerate(rows)
+            TaskBlock(row, range(first, first + each), tried["attempts"], tried["discarded_seeds"])
+            for row, first, tried in zip(rows, count(0, each), told["tasks"].values(), strict=False)
         ]
 
     @property

@@ -6,7 +6,7 @@ its time stamp on, until the next row of its style; every frame of an episode ha
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,7 @@ def persistent_rows(
     for start, stop in zip(starts, [*starts[1:], len(phases)], strict=True):
         # An object counts as placed while the hand still opens, and the one before may do so until after that.
         number = int(placements[start if phases[start] == Phase.RELEASE else stop - 1])
-        words = SUBTASKS[Phase(phases[start])].format(objects[min(number, len(objects) - 1)])
+        words = SUBTASKS[Phase(phases[start])].format(objects[np.clip(number, 0, len(objects) - 1)])
         rows.append(_row("assistant", words, "subtask", times[start]))
     return rows
 
@@ -89,7 +89,7 @@ def annotate(folder: Path, tasks: Sequence[Task]) -> None:
 
     for path in (path for path in files_below(folder, "data") if path.suffix == ".parquet"):
         table = read_parquet(path)
-        rows = said_of(table, tasks)
+        rows = said_of(table, tasks.__getitem__)
         table = table.replace_schema_metadata()  # which would tell `datasets` of the columns before
         table = table.append_column(PERSISTENT, pa.array(rows, pa.list_(ROW)))
         table = table.append_column(EVENTS, pa.array([[]] * len(rows), pa.list_(EVENT)))
@@ -99,17 +99,20 @@ def annotate(folder: Path, tasks: Sequence[Task]) -> None:
     (folder / INFO).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def said_of(table: pa.Table, tasks: Sequence[Task]) -> list[list[dict[str, Any]]]:
+READ = ("episode_index", "phase", "sim.placement", "timestamp")
+"""The columns that `said_of` reads."""
+
+
+def said_of(table: pa.Table, task_of: Callable[[int], Task]) -> list[list[dict[str, Any]]]:
     """What holds in the episode of each frame of a table.
 
     Args:
-        tasks: of all episodes of the data set.
+        task_of: the task of an episode by its number.
     """
-    names = ("episode_index", "phase", "sim.placement", "timestamp")
-    episodes, *columns = (np.asarray(table[name].to_pylist()).reshape(len(table)) for name in names)
+    episodes, *columns = (np.asarray(table[name].to_pylist()).reshape(len(table)) for name in READ)
     frames = {int(episode): np.flatnonzero(episodes == episode) for episode in dict.fromkeys(episodes)}
     said = {
-        episode: persistent_rows(tasks[episode], *(column[own] for column in columns))
+        episode: persistent_rows(task_of(episode), *(column[own] for column in columns))
         for episode, own in frames.items()
     }
     return [said[int(episode)] for episode in episodes]

@@ -11,6 +11,8 @@ import yaml
 from lerobot_constructskill.board.declaration import DRAWS, About
 from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit, with_draws
 from lerobot_constructskill.board.protocol import BoardSetting
+from lerobot_constructskill.board.rerun import instructions
+from lerobot_constructskill.board.submission import read_submission
 from lerobot_constructskill.envs.recording import COUNTS, RECORDINGS, Episode, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.submit import SubmitConfig
@@ -51,6 +53,18 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
     ]
     assert submission.declaration.settings_class == "custom" and submission.declaration.training_seeds == [0, 3]
     assert submission.declaration.backend == "physx_cpu, none rendering"
+
+
+def test_a_policy_may_act_in_the_full_action_and_is_run_again_in_it(tmp_path):
+    for start in (7, 8):
+        for perturb in ("", " pose=1"):
+            one = replace(recording(start, perturb=perturb), steps=0, actions=[])
+            for _ in range(2):
+                one.add(np.full(7, 0.01), NOTHING_YET)
+            one.write(tmp_path / "recorded" / "seed_0")
+    submission = made(tmp_path / "made", recorded_in(tmp_path / "recorded"))
+    assert [claim.environment["action"] for claim in read_submission(tmp_path / "made").claims] == ["full"] * 4
+    assert instructions(submission, "1").count("--env.action=full") == 2
 
 
 @pytest.mark.parametrize(
