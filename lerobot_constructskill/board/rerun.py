@@ -29,8 +29,8 @@ def instructions(submission: Submission, value: str) -> str:
     flags = [" ".join(f"--env.{name}='{one}'" for name, one in own.environment.items()) for own in settings.values()]
     commands = [
         "CONSTRUCTSKILL_RECORD=rerun/seed_N lerobot-eval --policy.path=CHECKPOINT --env.type=constructskill "
-        f"{env}{acting} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} --eval.batch_size=1 "
-        f"--seed={first}"
+        f"{env}{acting} --env.obs_type={declaration.about.observes} --eval.n_episodes={setting.episodes} "
+        f"--eval.batch_size=1 --seed={first}"
         for env, setting in zip(flags, settings.values(), strict=True)
     ]
     plain = {name: asdict(setting) for name, setting in settings.items()}
