@@ -76,6 +76,13 @@ FINGER_TARGETS = (-0.01, 0.04)
 STATE_NAMES = ("ee_x", "ee_y", "ee_z", "ee_rx", "ee_ry", "ee_rz", "finger_left", "finger_right")
 """Proprioception: position in metres and axis-angle in radians in the robot's base frame, fingers in metres."""
 
+FORCE_NAMES = ("force_x", "force_y", "force_z")
+"""What pulls at the wrist at the end of the step before, in newtons, in the robot's base frame.
+
+A force sensor between arm and hand shows the same once it is tared: the weight of what is held, what the hand presses
+on, and a newton or two of the hand's own inertia.
+"""
+
 POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 """A position in metres and a unit quaternion, w first."""
 
@@ -119,8 +126,8 @@ SIM_STATE = {
 
 A task is a list of placements. `object_*` and `bin_*` are of the next one, which is the first that is not done, or the
 last of all; `placement` is its number. The plurals are of all placements, in order; `is_object` says which numbers
-there are, the others are 0. Forces are those at the end of the step before, in newtons: the net force on each finger,
-and the largest between each object and another body.
+there are, the others are 0. Forces are those at the end of the step before, in newtons, without friction: the net
+force on each finger, and the largest between each object and another body.
 """
 
 PLURALS = {
@@ -196,8 +203,13 @@ CAMERAS = {
     )
 }
 
-OBS_TYPES = {"pixels": ("base",), "pixels_agent_pos": ("base", "wrist")}
-"""Cameras of each `obs_type`; `pixels_agent_pos` adds the 8-number state as well."""
+OBS_TYPES = {"pixels": ("base",), "pixels_agent_pos": ("base", "wrist"), "pixels_agent_pos_force": ("base", "wrist")}
+"""Cameras of each `obs_type`, from the one that shows least; all but `pixels` show the state as well."""
+
+
+def state_names(obs_type: str) -> tuple[str, ...]:
+    """Channels of the state: `STATE_NAMES`, and the force where `obs_type` asks for it."""
+    return (*STATE_NAMES, *FORCE_NAMES) if obs_type == "pixels_agent_pos_force" else STATE_NAMES
 
 
 LADDER = {f"brick_to_bin_{mm}mm": mm / 1000 for mm in (40, 20, 10, 5, 3)}

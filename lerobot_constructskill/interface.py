@@ -3,7 +3,7 @@
 It is `meta/contract.json` of every data set and `contract` of every environment.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import degrees
 from typing import Any
 
@@ -14,6 +14,7 @@ from lerobot_constructskill.contract import (
     ACTION_SCALE,
     CAMERAS,
     FINGER_TARGETS,
+    FORCE_NAMES,
     FPS,
     GRIPPER,
     GRIPPER_CLOSED,
@@ -30,23 +31,26 @@ from lerobot_constructskill.contract import (
 
 BASE_FRAME = "robot base: x forward, y to the left, z up; parallel to the world's axes"
 
-STATE_UNITS = dict(zip(STATE_NAMES, ("m",) * 3 + ("rad",) * 3 + ("m",) * 2, strict=True))
+STATE_UNITS = dict(zip((*STATE_NAMES, *FORCE_NAMES), ("m",) * 3 + ("rad",) * 3 + ("m",) * 2 + ("N",) * 3, strict=True))
+
+FELT = " Then the force that pulls at the wrist, as a tared sensor shows it."
 
 
-def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) -> dict[str, Any]:
+def describe_task(task: Task, cameras: Iterable[str], state: Sequence[str] = STATE_NAMES) -> dict[str, Any]:
     """The contract of `task`, as it is written to JSON.
 
     Cameras are the unperturbed ones, also where a perturbation moves them.
 
     Args:
         cameras: those that are shown, by their names in `contract.CAMERAS`.
-        has_state: `observation.state` is shown too, as in every data set.
+        state: channels of `observation.state`; empty where it is not shown.
     """
-    state = {
+    meaning = "Position of the end effector, its rotation as axis-angle, and the position of each finger."
+    shown = {
         "key": "observation.state",
         "frame": BASE_FRAME,
-        "meaning": "Position of the end effector, its rotation as axis-angle, and the position of each finger.",
-        "channels": [{"name": name, "unit": unit} for name, unit in STATE_UNITS.items()],
+        "meaning": meaning + (FELT if {*FORCE_NAMES} & {*state} else ""),
+        "channels": [{"name": name, "unit": STATE_UNITS[name]} for name in state],
     }
     return {
         "task": task.name,
@@ -68,7 +72,7 @@ def describe_task(task: Task, cameras: Iterable[str], has_state: bool = True) ->
             "moved_share": MOVED_SHARE,
             "channels": [_describe_channel(name) for name in task.action_names],
         },
-        **({"state": state} if has_state else {}),
+        **({"state": shown} if state else {}),
         "cameras": {name: _describe_camera(CAMERAS[name]) for name in cameras},
     }
 

@@ -20,7 +20,7 @@ Line = Annotated[str, LINE]
 Link = Annotated[str, Pattern(r"https://[A-Za-z0-9./_~%#?=&:+-]{1,300}", "an address that begins with https://")]
 Hash = Annotated[str, Pattern("[0-9a-f]{64}", "a SHA-256 in hexadecimal digits")]
 
-OBSERVES = ("pixels", "pixels_agent_pos", "privileged", "nothing")
+OBSERVES = (*OBS_TYPES, "privileged", "nothing")
 """What a policy sees: an `obs_type`, the simulator's own state (an expert), or nothing at all."""
 
 DRAWS = {"shared": "one draw of demonstrations", "own": "draws of demonstrations of their own"}

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lerobot_constructskill.board.declaration import About
+from lerobot_constructskill.board.declaration import OBSERVES, About
 from lerobot_constructskill.board.protocol import BoardSetting, environment_key
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
@@ -151,9 +151,10 @@ def submit(
     ended = [claim for claim in claims if claim.error is None]
     if not ended:
         raise InputError("Nothing was recorded.")
-    if about.observes == "pixels_agent_pos" and "pixels" in {claim.obs_type for claim in ended}:
+    poorer = OBSERVES[: OBSERVES.index(about.observes)] if about.is_policy else ()
+    if shown := {*poorer} & {claim.obs_type for claim in ended}:
         raise InputError(
-            "about.observes is pixels_agent_pos, but the policy was shown pixels: it can observe no more."
+            f"about.observes is {about.observes}, but the policy was shown {min(shown)}: it can observe no more."
         )
     return write_submission(
         root,

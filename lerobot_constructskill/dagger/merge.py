@@ -58,7 +58,7 @@ class MergedSet(Node):
             self._add_columns(base, first)
             aggregate(repo_id, [first, *driven], folder, Path(scratch))
         write_statistics(folder)
-        write_meanings(folder, config.rows, config.seen)
+        write_meanings(folder, config.rows, config.seen, config.state)
         facts = MADE.read(base.root / SIDECAR)
         facts["dagger"] = {
             "policy": self.rounds[0].policy.learner.facts(),
@@ -69,14 +69,15 @@ class MergedSet(Node):
         write_sidecar(folder, facts)
 
     def _add_columns(self, base: LeRobotDataset, folder: Path) -> None:
-        (task,), cameras = self.base.config.rows, self.base.config.seen
-        columns, frames = dagger_features(task, cameras), base.num_frames
+        (task,), config = self.base.config.rows, self.base.config
+        told = task, config.seen, config.state
+        columns, frames = dagger_features(*told), base.num_frames
         values = {
             "dagger.round": np.zeros((frames, 1), dtype=np.int64),
             "dagger.actor": np.full((frames, 1), EXPERT, dtype=object),
             "dagger.hopeless": np.zeros((frames, 1), dtype=bool),
         }
-        added = columns.keys() - demonstration_features(task, cameras).keys()
+        added = columns.keys() - demonstration_features(*told).keys()
         modify_features(
             base, {name: (values[name], columns[name]) for name in sorted(added)}, None, folder, base.repo_id
         )

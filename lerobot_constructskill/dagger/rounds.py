@@ -124,7 +124,7 @@ class Round(Node):
             with staged(shards / str(episode.seed)) as shard:
                 shard.mkdir()
                 if episode.frames:
-                    features = dagger_features(task, config.seen)
+                    features = dagger_features(task, config.seen, config.state)
                     write_episode(repo_id, task, features, episode.frames, shard / EPISODE, config.video)
                 outcome = json.dumps(asdict(DrivenEpisode.of(episode)))
                 (shard / OUTCOME).write_text(outcome + "\n", encoding="utf-8")

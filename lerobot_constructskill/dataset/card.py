@@ -10,12 +10,14 @@ import numpy as np
 from lerobot_constructskill.contract import (
     CAMERAS,
     DEMO_SEED_START,
+    FORCE_NAMES,
     FPS,
     OBS_TYPES,
     ROTATION,
     TASK_ACTION,
     held_out,
     select_tasks,
+    state_names,
 )
 from lerobot_constructskill.dataset.dataset import DataSet, check_provenance_fields
 from lerobot_constructskill.demos.columns import LANGUAGE, SIDECAR, as_made, dagger_features, demonstration_features
@@ -47,7 +49,7 @@ MEANINGS = {
     "sim.bin_interiors": "privileged: inner edges of that, m",
     "sim.is_object": "privileged: 1 for each object that there is, 0 for the rest of the nine",
     "sim.is_placed": "privileged: 1 for each object that is placed",
-    "sim.finger_forces": "privileged: net contact force on each finger, N, world frame",
+    "sim.finger_forces": "privileged: net contact force on each finger, without friction, N, world frame",
     "sim.object_forces": "privileged: largest contact force between each object and another body, N",
     "sim.seed": "seed of the episode's initial state and noise",
     "language_persistent": "the expert's subtasks, each from its first frame on, and other words for the task",
@@ -68,6 +70,9 @@ ADVISED = {
 
 ACTIVE = re.compile(r"[\x00-\x1f`]|\]\(")
 """Characters that would end a line, a piece of code or a link's name; HTML is escaped too."""
+
+FELT = "; what pulls at the wrist (N)"
+"""What follows the meaning of a state that has the force."""
 
 TURNS = "; turns in rad about the same axes, right-handed"
 """What follows the meaning of an action in a task that turns."""
@@ -132,8 +137,8 @@ def render(facts: dict[str, Any]) -> str:
     selected = select_tasks(generator["task"], generator.get("action", TASK_ACTION))
     tasks = [task for suite in selected.values() for task in suite]
     columns = dagger_features if "dagger" in facts else demonstration_features
-    seen = generator.get("cameras") or OBS_TYPES[generator["obs_type"]]
-    features = as_made(columns(tasks[0], seen), bool(facts.get("joints")), bool(facts.get("placements")))
+    seen, state = generator.get("cameras") or OBS_TYPES[generator["obs_type"]], state_names(generator["obs_type"])
+    features = as_made(columns(tasks[0], seen, state), bool(facts.get("joints")), bool(facts.get("placements")))
     features |= LANGUAGE if generator.get("annotate") else {}
     cameras = [CAMERAS[name] for name in seen]
     sigma = 1000 * np.sqrt(np.diag(facts["noise_covariance"]))
@@ -144,11 +149,12 @@ def render(facts: dict[str, Any]) -> str:
         fps=FPS,
         seed_start=DEMO_SEED_START,
         cameras=cameras,
-        contract=describe_task(tasks[0], [camera.name for camera in cameras]),
+        contract=describe_task(tasks[0], [camera.name for camera in cameras], state),
         features={name: feature for name, feature in features.items() if name in MEANINGS},
         meanings=MEANINGS
         | (ADVISED if "dagger" in facts or generator["labels"] == "advice" else {})
-        | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*tasks[0].action_names} else {}),
+        | ({"action": MEANINGS["action"] + TURNS} if {*ROTATION} & {*tasks[0].action_names} else {})
+        | ({"observation.state": MEANINGS["observation.state"] + FELT} if {*FORCE_NAMES} & {*state} else {}),
         sigma_mm=[round(float(value), 2) for value in sigma],
         rename_map=_rename_map([camera.key for camera in cameras]),
     )

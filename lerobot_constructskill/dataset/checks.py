@@ -107,7 +107,7 @@ def check_values(data: DataSet) -> Iterator[str]:
         too_far, too_much = (largest > limit + 1e-6).any(), turned > ACTION_SCALE + 1e-6
         yield from _found({units: too_far, turns: too_much, gripper: odd.any()})
     state, rewards = data.column("observation.state"), (0, REWARD_LIFTED, REWARD_PLACED)
-    reach, fingers = np.linalg.norm(state[:, :3], axis=1).max(), state[:, 6:]
+    reach, fingers = np.linalg.norm(state[:, :3], axis=1).max(), state[:, 6:8]
     yield from _found(
         {
             f"observation.state has positions beyond the robot's reach of {REACH} m.": reach > REACH,

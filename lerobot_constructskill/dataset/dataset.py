@@ -193,7 +193,7 @@ class DataSet:
         A set without any column of joints, or of placements, was made before these were recorded.
         """
         made = dagger_features if "dagger" in self.facts else demonstration_features
-        features = made(self.config.rows[0], self.config.seen)
+        features = made(self.config.rows[0], self.config.seen, self.config.state)
         return as_made(features, self.has_joints, self.has_placements) | (LANGUAGE if self.config.annotate else {})
 
     @property

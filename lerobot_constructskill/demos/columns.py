@@ -4,7 +4,7 @@ Every LeRobot policy consumes each `observation.*` column and predicts each `act
 bear those names.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, TypedDict
 
 from lerobot_constructskill.contract import CAMERAS, IMAGE_SIZE, PLURALS, SIM_STATE, STATE_NAMES, Task
@@ -44,11 +44,17 @@ VIDEO = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["heig
 """The column of a camera."""
 
 
-def demonstration_features(task: Task, cameras: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen by `cameras`."""
+def demonstration_features(
+    task: Task, cameras: Iterable[str], state: Sequence[str] = STATE_NAMES
+) -> dict[str, dict[str, Any]]:
+    """The `features` of `LeRobotDataset.create` for demonstrations of `task` seen by `cameras`.
+
+    Args:
+        state: channels of `observation.state`, as `contract.state_names` says.
+    """
     return {
         **{CAMERAS[name].key: dict(VIDEO) for name in cameras},
-        "observation.state": _column("float32", *STATE_NAMES),
+        "observation.state": _column("float32", *state),
         "action": _column("float32", *task.action_names),
         "dart.executed_action": _column("float32", *task.action_names),
         "dart.noise": _column("float32", *task.action_names[:3]),
@@ -61,9 +67,11 @@ def demonstration_features(task: Task, cameras: Iterable[str]) -> dict[str, dict
     }
 
 
-def dagger_features(task: Task, cameras: Iterable[str]) -> dict[str, dict[str, Any]]:
+def dagger_features(
+    task: Task, cameras: Iterable[str], state: Sequence[str] = STATE_NAMES
+) -> dict[str, dict[str, Any]]:
     """The columns of `demonstration_features`, and those that say who acted."""
-    return demonstration_features(task, cameras) | {
+    return demonstration_features(task, cameras, state) | {
         "dagger.round": _column("int64", "round"),
         "dagger.actor": _column("string", "actor"),
         "dagger.hopeless": _column("bool", "hopeless"),

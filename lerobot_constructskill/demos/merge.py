@@ -50,7 +50,7 @@ def merge(config: GenerateConfig, blocks: list[Block], folder: Path) -> None:
     write_statistics(folder)
     if config.annotate:
         annotate(folder, [row for row, block in zip(config.rows, blocks, strict=True) for _ in block.demonstrations])
-    write_meanings(folder, config.rows, config.seen)
+    write_meanings(folder, config.rows, config.seen, config.state)
     of_tasks = {}
     if len(blocks) > 1:
         name_tasks(folder, [block.config.task for block in blocks for _ in block.demonstrations])

@@ -9,7 +9,15 @@ from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import digest, versions
 from lerobot_constructskill.artifacts.pools import EXECUTORS
 from lerobot_constructskill.bounds import Among, Count, Range, RepoId, Seed, Steps, Text, Workers, check
-from lerobot_constructskill.contract import ACTIONS, DEMO_SEED_START, OBS_TYPES, TASK_ACTION, Task, select_tasks
+from lerobot_constructskill.contract import (
+    ACTIONS,
+    DEMO_SEED_START,
+    OBS_TYPES,
+    TASK_ACTION,
+    Task,
+    select_tasks,
+    state_names,
+)
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.expert import ExpertConfig
 from lerobot_constructskill.demos.noise import NoiseConfig
@@ -34,7 +42,7 @@ class GenerateConfig:
             has their demonstrations one task after another, in this order.
         episodes: successful demonstrations to record, of each task.
         obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera). The state is always
-            recorded.
+            recorded; with `pixels_agent_pos_force` it has the force at the wrist too.
         cameras: those of `obs_type` that are rendered and recorded, such as `[wrist]`; all by default. One of two
             takes less time and disk.
         max_steps: steps after which an attempt counts as failed.
@@ -107,6 +115,11 @@ class GenerateConfig:
         return tuple(name for name in offered if self.cameras is None or name in self.cameras)
 
     @property
+    def state(self) -> tuple[str, ...]:
+        """The channels of `observation.state`."""
+        return state_names(self.obs_type)
+
+    @property
     def starts(self) -> range:
         """Seeds of all attempts that the generation may make at each task."""
         return range(self.seed_start, self.seed_start + self.episodes + int(self.max_failures * self.episodes))
@@ -150,7 +163,7 @@ def frames_digest(config: GenerateConfig) -> str:
 
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
     """The encoder's options, the columns and the plans, on which a data set depends beside its settings."""
-    columns = demonstration_features(config.rows[0], config.seen)
+    columns = demonstration_features(config.rows[0], config.seen, config.state)
     plans = {row.name: read_plan(row.plan).facts() for row in config.rows if row.plan is not None}
     if plans:
         plans = {"plans": plans} if len(config.rows) > 1 else {"plan": plans[config.rows[0].name]}

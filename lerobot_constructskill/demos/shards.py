@@ -91,7 +91,7 @@ def attempt(config: GenerateConfig, seed: int, folder: Path) -> Attempt:
     with staged(folder / str(seed)) as shard:
         shard.mkdir()
         if success:
-            features = demonstration_features(task, config.seen)
+            features = demonstration_features(task, config.seen, config.state)
             write_episode(config.repo_id, task, features, frames, shard / EPISODE, config.video)
         (shard / OUTCOME).write_text(json.dumps(asdict(outcome)), encoding="utf-8")
     return outcome

@@ -16,9 +16,9 @@ from lerobot_constructskill.contract import (
     IMAGE_SIZE,
     OBS_TYPES,
     PLANNED,
-    STATE_NAMES,
     TASK_ACTION,
     select_tasks,
+    state_names,
 )
 from lerobot_constructskill.envs.freeze import LazyAsyncVectorEnv, SyncVectorEnv
 from lerobot_constructskill.envs.gym_env import SEEING, ActionForm, ConstructSkillEnv, ObsType, perturbed_task
@@ -39,8 +39,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         task: a name in `contract.TASKS` or in `contract.SUITES`, or several separated by commas, whose actions
             must be the same.
         plan: a plan in `configs/plan` or a file: the wall that is built instead of a task.
-        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the 8-number
-            state, for policies that need them).
+        obs_type: `pixels` (the base camera), `pixels_agent_pos` (adds the wrist camera and the 8-number state, for
+            policies that need them) or `pixels_agent_pos_force` (adds the force at the wrist to that state).
         episode_length: horizon of an evaluation episode in steps; the task's own by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
             Training and evaluation should see the same robot.
@@ -82,8 +82,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         cameras = {CAMERAS[name].key: image for name in OBS_TYPES[self.obs_type]}
         self.features = {"action": PolicyFeature(FeatureType.ACTION, (len(rows[0].action_names),)), **cameras}
         self.features_map = {name: name for name in self.features}
-        if self.obs_type == "pixels_agent_pos":
-            self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))
+        if self.obs_type != "pixels":
+            self.features["agent_pos"] = PolicyFeature(FeatureType.STATE, (len(state_names(self.obs_type)),))
             self.features_map["agent_pos"] = "observation.state"
 
     @property

@@ -23,6 +23,7 @@ from lerobot_constructskill.contract import (
     TASK_ACTION,
     Task,
     get_task,
+    state_names,
 )
 from lerobot_constructskill.envs.actions import action_bounds, normalised
 from lerobot_constructskill.envs.recording import COUNTS, keep, recorder
@@ -60,21 +61,22 @@ class ConstructSkillEnv(gym.Env):
     """A task of the contract table for LeRobot's scripts, or for any Gymnasium user.
 
     Observations are `{"pixels": {camera: (224, 224, 3) uint8}}`, with `obs_type="pixels_agent_pos"` also
-    `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it. An action is (dx, dy, dz) in metres, in tasks
-    that turn dyaw in radians, and the gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. With
-    `action="full"` it is `contract.FULL_ACTION` in every task; a scene that holds the hand level overwrites the
-    rotations that its task does not name. The reward is the stage reached: 0, 0.5 once lifted, 1 once all is placed.
-    `info` holds `is_success`, the named booleans of the scene, `clipped_steps`, how many of the episode's actions were
-    clipped, `placements`, how many of the task's are done, `chain`, how many before the first that is not, and what
-    was unsafe: `cost` of the step, and of the episode `peak_force` (N), `drops`, `knocks` and `collisions`; after a
-    reset also `contract`, as JSON.
+    `"agent_pos": (8,) float32` as `contract.STATE_NAMES` names it, and with `"pixels_agent_pos_force"` three numbers
+    more, `contract.FORCE_NAMES`. An action is (dx, dy, dz) in metres, in tasks that turn dyaw in radians, and the
+    gripper, +1 open, -1 closed, float32; more than 0.1 is clipped. With `action="full"` it is `contract.FULL_ACTION`
+    in every task; a scene that holds the hand level overwrites the rotations that its task does not name. The reward
+    is the stage reached: 0, 0.5 once lifted, 1 once all is placed. `info` holds `is_success`, the named booleans of
+    the scene, `clipped_steps`, how many of the episode's actions were clipped, `placements`, how many of the task's
+    are done, `chain`, how many before the first that is not, and what was unsafe: `cost` of the step, and of the
+    episode `peak_force` (N), `drops`, `knocks` and `collisions`; after a reset also `contract`, as JSON.
 
     Non-obvious behaviours: the simulator starts with the first `reset`, in the process that calls it, so
     constructing an environment costs nothing. `render` shows a close-up, not what the policy sees.
 
     Args:
         task: a name in `contract.TASKS`, or `plan:NAME_OR_FILE`.
-        obs_type: `pixels` (the base camera) or `pixels_agent_pos` (adds the wrist camera and the state).
+        obs_type: `pixels` (the base camera), `pixels_agent_pos` (adds the wrist camera and the state) or
+            `pixels_agent_pos_force` (adds the force at the wrist to the state).
         episode_length: steps after which an episode is truncated; the task's horizon by default.
         light_robot: draw the robot with decimated meshes; by default only where frames are rendered on a CPU.
         render_backend: "auto" (a GPU that can render, else the CPU), "gpu", "cpu", or "none": physics alone, ten
@@ -139,8 +141,8 @@ class ConstructSkillEnv(gym.Env):
         self._recording = None
         image = spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         space = {"pixels": spaces.Dict(dict.fromkeys(self.cameras, image))}
-        if obs_type == "pixels_agent_pos":
-            space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(STATE_NAMES),), np.float32)
+        if obs_type != "pixels":
+            space["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(state_names(obs_type)),), np.float32)
         self.observation_space = spaces.Dict(space)
         self.action_space = spaces.Box(*action_bounds(len(self._row.action_names)), dtype=np.float32)
 
@@ -190,7 +192,7 @@ class ConstructSkillEnv(gym.Env):
     @property
     def contract(self) -> dict[str, Any]:
         """What actions and observations mean, as `interface.describe_task` says: units, ranges, frames and cameras."""
-        return describe_task(self._row, self.cameras, has_state=self.obs_type == "pixels_agent_pos")
+        return describe_task(self._row, self.cameras, () if self.obs_type == "pixels" else state_names(self.obs_type))
 
     # For experts and recorders
 
@@ -202,8 +204,11 @@ class ConstructSkillEnv(gym.Env):
 
     @one_thread()
     def agent_state(self) -> np.ndarray:
-        """Proprioception as `contract.STATE_NAMES` names it, (8,) float32. Raises as `step` does."""
-        return self.started().agent_state()[0].cpu().numpy().astype(np.float32)
+        """The state, which `pixels` does not show, as `contract.state_names` names it: (8,) or (11,) float32.
+
+        Raises as `step` does.
+        """
+        return self._agent_states()[0]
 
     @property
     def light_robot(self) -> bool:
@@ -288,9 +293,15 @@ class ConstructSkillEnv(gym.Env):
         # Without the gaps of a fourth channel a picture is sent to another process faster. Channel by channel it is
         # copied faster than pixel by pixel.
         seen = {"pixels": {name: np.stack([*np.moveaxis(rgb, -1, 0)], axis=-1) for name, rgb in pictures.items()}}
-        if self.obs_type == "pixels_agent_pos":
-            seen["agent_pos"] = self.started().agent_state().cpu().numpy().astype(np.float32)
+        if self.obs_type != "pixels":
+            seen["agent_pos"] = self._agent_states()
         return seen
+
+    def _agent_states(self) -> np.ndarray:
+        """The state of every copy, (num_copies, 8) or (num_copies, 11) float32."""
+        scene = self.started()
+        parts = [scene.agent_state(), *([scene.force()] if state_names(self.obs_type) != STATE_NAMES else [])]
+        return np.concatenate([part.cpu().numpy() for part in parts], axis=1).astype(np.float32)
 
     def _observation(self, obs: dict[str, Any]) -> dict[str, Any]:
         seen = self.observations(obs)

@@ -36,7 +36,7 @@ class Step:
         sim: privileged state, `contract.SIM_STATE` name to float32 array.
         done: whether the episode is over.
         info: as of `ConstructSkillEnv.step`.
-        agent_state: proprioception, (8,) float32.
+        agent_state: proprioception, as `ConstructSkillEnv.agent_state`.
         backend: what simulates and renders, as `ConstructSkillEnv.backend`.
     """
 

@@ -1,4 +1,7 @@
-"""What touches what, and how hard: forces at the fingers and on objects, and what counts as unsafe."""
+"""What touches what, and how hard: forces at the fingers and on objects, and what counts as unsafe.
+
+PhysX tells of a contact what presses, not what rubs: the fingers do not feel the weight of what they hold.
+"""
 
 from collections import defaultdict
 from dataclasses import dataclass

@@ -16,7 +16,7 @@ from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.building import ActorBuilder
-from mani_skill.utils.geometry.rotation_conversions import quaternion_to_axis_angle
+from mani_skill.utils.geometry.rotation_conversions import quaternion_apply, quaternion_to_axis_angle
 from mani_skill.utils.structs import Actor, Pose
 from mani_skill.utils.structs.types import SimConfig
 from torch.nn.functional import pad
@@ -494,6 +494,14 @@ class PickPlaceEnv(BaseEnv):
         tcp = seen_from(self.agent.robot.root, self.agent.tcp)
         rotation = quaternion_to_axis_angle(torch.where(tcp.q[:, 1:2] < 0, -tcp.q, tcp.q).double()).float()
         return torch.cat([tcp.p, rotation, self.agent.robot.get_qpos()[:, -2:]], dim=-1)
+
+    @outside_autocast
+    def force(self) -> torch.Tensor:
+        """What pulls at the wrist as `contract.FORCE_NAMES` names it, (num_envs, 3)."""
+        robot = self.agent.robot
+        hand = robot.links_map["panda_hand"]
+        pull = robot.get_link_incoming_joint_forces()[:, hand.index[0], :3]  # in the hand's frame
+        return quaternion_apply(seen_from(robot.root, hand).q, pull)
 
     @outside_autocast
     def privileged_state(self) -> dict[str, torch.Tensor]:

@@ -15,7 +15,7 @@ from lerobot.utils import OBS_STATE
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.digests import versions
 from lerobot_constructskill.artifacts.store import Machine, Node
-from lerobot_constructskill.contract import OBS_TYPES
+from lerobot_constructskill.contract import OBS_TYPES, state_names
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.training.recipe import FACTS, Training, held_out_of
 from lerobot_constructskill.training.trainers import Learner, flush_denormals
@@ -35,14 +35,21 @@ def check_inputs(policy: PreTrainedConfig, obs_type: str, recorded: Sequence[str
         recorded: the cameras of the demonstrations; None where it does not learn.
 
     Raises:
-        InputError: it reads the state, and observations have pictures alone, or a camera that they, or the
-            demonstrations, do not have.
+        InputError: it reads the state, and observations have pictures alone or another state, or a camera that they,
+            or the demonstrations, do not have.
     """
     # LeRobot gives a policy that does not name its inputs all of the data set; its own types read the state in it.
     unsaid = getattr(policy, "use_state", type(policy).__module__.startswith("lerobot."))
     reads_state = OBS_STATE in policy.input_features if policy.input_features else unsaid
     if reads_state and obs_type == "pixels":
         raise InputError("The policy reads observation.state; where it acts, obs_type has to be 'pixels_agent_pos'.")
+    lengths = {one: len(state_names(one)) for one in OBS_TYPES}
+    read = (policy.input_features or {}).get(OBS_STATE)
+    if read is not None and lengths[obs_type] != read.shape[0] in lengths.values():  # SmolVLA fills up other lengths
+        raise InputError(
+            f"The policy reads a state of {read.shape[0]} numbers; where it acts, obs_type '{obs_type}' has "
+            f"{lengths[obs_type]}."
+        )
     camera, shown = getattr(policy, "camera", None), OBS_TYPES[obs_type]  # others look at whatever they are shown
     cameras = {*camera.split("+")} if camera else set()
     if not cameras <= {*shown}:

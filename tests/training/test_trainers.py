@@ -149,6 +149,16 @@ def test_a_policy_of_others_that_names_no_inputs_is_not_taken_to_read_the_state(
         check_inputs(ACTConfig(), "pixels")
 
 
+def test_a_policy_that_feels_a_force_is_not_let_into_an_environment_without_it():
+    def reads(length):
+        return SimpleNamespace(input_features={"observation.state": SimpleNamespace(shape=(length,))})
+
+    for length, obs_type in ((8, "pixels_agent_pos"), (11, "pixels_agent_pos_force"), (6, "pixels_agent_pos")):
+        check_inputs(reads(length), obs_type)
+    with pytest.raises(InputError, match="reads a state of 11 numbers; .* 'pixels_agent_pos' has 8"):
+        check_inputs(reads(11), "pixels_agent_pos")
+
+
 def test_a_gpus_checkpoint_is_another_and_a_studys_rows_of_a_cpu_are_found_beside_a_gpu(monkeypatch):
     here, there = ACTConfig(device="cpu"), ACTConfig(device="cpu")
     there.device = "cuda:1"  # as on a machine that has one: LeRobot takes the CPU here
