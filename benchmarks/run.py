@@ -2,9 +2,9 @@
 
 Usage: python benchmarks/run.py [name ...]
 
-The names are rendering, resets, encoders, training, keypoints, side_by_side, evaluation and scaling; all by default.
-Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the fast set
-are made on the first run, in outputs/bench ($BENCH_OUT).
+The names are rendering, resets, encoders, training, keypoints, side_by_side, walls, evaluation and scaling; all by
+default. Each replaces its last lines when it is done, and the others keep theirs. Demonstrations and features of the
+fast set are made on the first run, in outputs/bench ($BENCH_OUT).
 """
 
 import json
@@ -22,7 +22,7 @@ from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.policies.frozen_vit.precision import ISA_CAP, native_precision
 
 HERE = Path(__file__).parent
-NAMES = ("rendering", "resets", "encoders", "training", "keypoints", "side_by_side", "evaluation", "scaling")
+NAMES = ("rendering", "resets", "encoders", "training", "keypoints", "side_by_side", "walls", "evaluation", "scaling")
 PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "openvino", "onnxruntime")
 LINES = HERE / "results.jsonl"
 
