@@ -1,7 +1,8 @@
 """The axes along which any task can be perturbed, and their levels. Standard library only.
 
 Level 0 is the task as it is. What is drawn once (camera, light, textures, size, distractors) follows from the axis
-and a seed alone; what it draws every episode (initial pose, sensor noise) from the episode's own seed.
+and a seed alone; what it draws every episode (initial pose, sensor noise) from the episode's own seed. The latency
+draws nothing.
 """
 
 import re
@@ -18,20 +19,35 @@ class Axis:
     Args:
         unit: what a level's number is.
         levels: the numbers of levels 1, 2, ...
+        changes: which of `CHANGEABLE` it changes by itself; nothing else differs but what follows from these.
     """
 
     unit: str
     levels: tuple[float, ...]
+    changes: tuple[str, ...]
 
+
+BODIES = ("robot", "object", "receptacle")
+CHANGEABLE = ("base", "wrist", *BODIES, "execution", "instruction")
+"""The pictures of both cameras, the state of the bodies at the start, how an action is executed, and the sentence."""
+
+_BOTH = ("base", "wrist")
 
 AXES = {
-    "camera": Axis("metres between the base camera's eye and its nominal place", (0.02, 0.05, 0.10)),
-    "light": Axis("relative change of the lights' brightness, and of their direction", (0.2, 0.4, 0.6)),
-    "texture": Axis("relative change of the brick's and the ground's colour, with another pattern", (0.1, 0.2, 0.4)),
-    "size": Axis("factor of the square root of a brick's dimension: EN 771-1's categories T2 and T1", (0.25, 0.40)),
-    "distractors": Axis("fixed offcuts beside the work", (1, 2, 4)),
-    "pose": Axis("standard deviation of the robot's initial joint angles in radians", (0.01, 0.02, 0.04)),
-    "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16)),
+    "camera": Axis("metres between the base camera's eye and its nominal place", (0.02, 0.05, 0.10), ("base",)),
+    "light": Axis("relative change of the lights' brightness, and of their direction", (0.2, 0.4, 0.6), _BOTH),
+    "texture": Axis(
+        "relative change of the brick's and the ground's colour, with another pattern", (0.1, 0.2, 0.4), _BOTH
+    ),
+    "size": Axis(
+        "factor of the square root of a brick's dimension: EN 771-1's categories T2 and T1",
+        (0.25, 0.40),
+        ("object", "receptacle"),
+    ),
+    "distractors": Axis("fixed offcuts beside the work", (1, 2, 4), _BOTH),
+    "pose": Axis("standard deviation of the robot's initial joint angles in radians", (0.01, 0.02, 0.04), ("robot",)),
+    "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16), _BOTH),
+    "latency": Axis("steps by which an action is executed late", (1, 2, 4), ("execution",)),
 }
 
 PICTURES = ("light", "texture", "sensor")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from lerobot_constructskill.bounds import Range, Seed, check
 from lerobot_constructskill.contract import DEMO_SEED_STOP, SUITES, get_task
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.perturbations import AXES, Perturbation
+from lerobot_constructskill.perturbations import Perturbation
 
 FIRST_START = 5000
 """Seed of the first evaluation start. Nothing was trained on it or on those that follow; docs/leaderboard.md says what
@@ -31,7 +31,10 @@ FIXED = ("brick_to_bin",)
 """Tasks with one initial state: one episode, as all others would repeat it."""
 
 PERTURBED_TASK, LEVEL = "brick_to_bin_shifted", 2
-"""The suite `perturbed` is this task with each axis at this level, beside the task as it is."""
+"""The suite `perturbed` is this task with each of `PERTURBED_AXES` at this level, beside the task as it is."""
+
+PERTURBED_AXES = ("camera", "light", "texture", "size", "distractors", "pose", "sensor")
+"""Those of `perturbations.AXES` that the suite has; with another one, all entries would lack a setting."""
 
 CONTROL = "control"
 """Name of the setting without a perturbation, beside those with one."""
@@ -134,7 +137,7 @@ def _settings(tasks: tuple[str, ...]) -> dict[str, BoardSetting]:
 
 
 _PERTURBED = {CONTROL: BoardSetting(PERTURBED_TASK)} | {
-    axis: BoardSetting(PERTURBED_TASK, perturb=f"{axis}={LEVEL}") for axis in AXES
+    axis: BoardSetting(PERTURBED_TASK, perturb=f"{axis}={LEVEL}") for axis in PERTURBED_AXES
 }
 
 BOARD_SUITES = {

@@ -1,4 +1,4 @@
-"""What the scene does to an action: clips and counts what the controller cannot give, and holds the hand level.
+"""What the scene does to an action: clips and counts what the controller cannot give, delays it, holds the hand level.
 
 `pd_ee_delta_pose` is a spring from the current pose, so a hand that is never told its rotation tilts by some 0.006 rad
 a step under a held brick. That is the paper's scene. A receptacle with a few millimetres of play needs a level brick:
@@ -12,10 +12,12 @@ from typing import ClassVar
 import torch
 from mani_skill.utils.geometry.rotation_conversions import quaternion_invert, quaternion_multiply
 
-from lerobot_constructskill.contract import ACTION_SCALE, ROTATION_SIGN, TRANSLATION
+from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, ROTATION, ROTATION_SIGN, TRANSLATION
 
 LEAST, SHARE = 10, 0.1
 """An episode with at least so many clipped actions, and more than this share of all so far, is warned of."""
+
+N_TRANSLATION, N_MOTION = len(TRANSLATION), len(TRANSLATION) + len(ROTATION)
 
 logger = logging.getLogger(__name__)
 
@@ -55,10 +57,28 @@ class Clipping:
         return action.clamp(-1, 1)
 
 
-HOLDING = "pd_ee_delta_pose"
-"""The control mode whose actions are clipped and held; actions of other modes are left as they are."""
+class Delay:
+    """Executes the actions of `num_envs` episodes `steps` steps late; until then the hand stays, its gripper open."""
 
-N_TRANSLATION = len(TRANSLATION)
+    def __init__(self, num_envs: int, device: torch.device, steps: int):
+        self._rest = torch.tensor([0.0] * N_MOTION + [GRIPPER_OPEN], device=device)
+        self._waiting = self._rest.expand(steps, num_envs, -1).clone()
+
+    def apply(self, action: torch.Tensor) -> torch.Tensor:
+        """Take `action`, (7,) or (num_envs, 7), and return the one that is due, of its shape."""
+        if not len(self._waiting):
+            return action
+        given = action.expand_as(self._waiting[0]).to(self._rest.dtype)
+        due, self._waiting = self._waiting[0], torch.stack([*self._waiting[1:], given])
+        return due.reshape(action.shape)
+
+    def forget(self, env_idx: torch.Tensor) -> None:
+        """Begin the episodes of these environments."""
+        self._waiting[:, env_idx] = self._rest
+
+
+HOLDING = "pd_ee_delta_pose"
+"""The control mode whose actions are clipped, delayed and held; actions of other modes are left as they are."""
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,11 @@ class Draws:
             side + factor * np.sqrt(side * 1000) / 1000 * rng.uniform(-1, 1) if factor else side for side in size
         )
 
+    @property
+    def latency(self) -> int:
+        """Steps by which an action is executed late; 0 where this axis is not perturbed."""
+        return int(self.perturbation.amount("latency"))
+
     def offcuts(self, taken: np.ndarray, clearance: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Size and place, each (3,) metres, of boxes on the ground at least `clearance` from every row of `taken`."""
         rng, boxes = self._rng("distractors"), []

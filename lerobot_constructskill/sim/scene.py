@@ -37,7 +37,7 @@ from lerobot_constructskill.contract import (
 )
 from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.perturbations import Perturbation
-from lerobot_constructskill.sim.actions import HOLDING, Clipping, Hold
+from lerobot_constructskill.sim.actions import HOLDING, Clipping, Delay, Hold
 from lerobot_constructskill.sim.backends import best_render_backend, enable_gpu_physics, machine_lacks, steps_on_gpu
 from lerobot_constructskill.sim.contacts import Safety, touch
 from lerobot_constructskill.sim.perturb import Draws
@@ -158,6 +158,8 @@ class PickPlaceEnv(BaseEnv):
         self.draws = Draws(perturbation or Perturbation())
         if self.draws.perturbation.amount("size") and not self.is_brick:
             raise InputError("The axis 'size' is EN 771-1's tolerance of bricks; this task has no brick.")
+        if self.draws.latency and control_mode != HOLDING:
+            raise InputError(f"The axis 'latency' delays actions of {HOLDING}, not of {control_mode}.")
         self.object_size = self.draws.brick(self.object_size)
         if render_backend == "auto":
             render_backend = best_render_backend()
@@ -247,6 +249,7 @@ class PickPlaceEnv(BaseEnv):
         self._unmet: dict[str, torch.Tensor] = {}  # by condition: the last step in which it was not met
         self._lasted: dict[str, torch.Tensor] = {}
         self._clipping = Clipping(self.num_envs, self.device)
+        self._delay = Delay(self.num_envs, self.device, self.draws.latency)
         self._safety = Safety(self.num_envs, len(self.objects), self.device)
 
     def _load_placements(self) -> None:
@@ -353,6 +356,7 @@ class PickPlaceEnv(BaseEnv):
             for memory in (*kept, *self._unmet.values(), *self._lasted.values()):
                 memory[env_idx] = 0
             self._safety.forget(env_idx)
+            self._delay.forget(env_idx)
 
     def _initialize_objects(self, env_idx: torch.Tensor) -> None:
         offsets = torch.from_numpy(self._spawn_offsets(self._batched_episode_rng[env_idx])).float()
@@ -387,6 +391,7 @@ class PickPlaceEnv(BaseEnv):
     def _step_action(self, action):
         if self.control_mode == HOLDING and isinstance(action, np.ndarray | torch.Tensor):
             action = self._clipping.apply(common.to_tensor(action, device=self.device), self.elapsed_steps)
+            action = self._delay.apply(action)
             if self.hold is not None:
                 action = self.hold.apply(action, self.agent.tcp.pose.q)
         return super()._step_action(action)

@@ -13,6 +13,7 @@ from lerobot_constructskill.board.protocol import (
     FIRST_FRESH,
     LEVEL,
     LEVELS,
+    PERTURBED_AXES,
     PERTURBED_TASK,
     RANKED_FROM,
     RERUN_ALPHA,
@@ -24,7 +25,6 @@ from lerobot_constructskill.board.protocol import (
 )
 from lerobot_constructskill.contract import DEMO_SEED_START, STAGES
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.perturbations import AXES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "leaderboard.md").read_text()
 
@@ -68,8 +68,9 @@ def test_the_pages_files_are_what_submit_reads():
 
 def test_a_perturbed_setting_has_its_control():
     settings = BOARD_SUITES["perturbed"].settings
-    assert settings.keys() == {CONTROL, *AXES}
-    assert {one.perturbation for one in settings.values()} == {"", *(f"+{axis}={LEVEL}+seed=0" for axis in AXES)}
+    perturbed = {f"+{axis}={LEVEL}+seed=0" for axis in PERTURBED_AXES}
+    assert settings.keys() == {CONTROL, *PERTURBED_AXES}
+    assert {one.perturbation for one in settings.values()} == {"", *perturbed}
     assert len({(one.task, one.starts, one.episode_length) for one in settings.values()}) == 1
 
 

@@ -1,22 +1,31 @@
 """Every axis does what it says and nothing else, the same every time, and leaves the task alone at level 0."""
 
+import re
+import sys
 from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from lerobot_constructskill.board.protocol import BoardSetting
-from lerobot_constructskill.contract import TASKS
+from lerobot_constructskill.contract import TASKS, get_task
+from lerobot_constructskill.demos.demonstrate import demonstrate
+from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
+from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError, UserError
-from lerobot_constructskill.perturbations import AXES, Perturbation
+from lerobot_constructskill.perturbations import AXES, BODIES, Perturbation
 
-SEEN = set(AXES) - {"size"}
-"""Axes that show in the first picture by a margin; a brick some millimetres larger hardly does."""
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
+from axes import Difference, complaints, replay  # noqa: E402
 
-PHYSICAL = {"size", "pose"}
-"""Axes that change the state the expert sees at the start."""
+TASK = get_task("brick_to_bin")
+LEVELS = [(axis, level) for axis, of in AXES.items() for level in range(1, len(of.levels) + 1)]
 
 
 def start(seed=0, **kwargs):
@@ -33,12 +42,69 @@ def nominal():
     return start()
 
 
+@pytest.fixture(scope="module")
+def grasped():
+    """The expert's actions until it has the brick in the jaws, and the episode."""
+    env, expert = ConstructSkillEnv("brick_to_bin", render_backend="none"), make_expert(TASK, ExpertConfig())
+    frames, _ = demonstrate(env, expert, NoiseConfig(sigma=0.0), 0)
+    env.close()
+    actions = [frame["action"] for frame in frames if frame["phase"] in ("PREGRASP", "DESCEND", "GRASP")]
+    return actions, replay(actions, task=TASK.name)
+
+
 @pytest.mark.sim
 @pytest.mark.parametrize("axis", AXES)
-def test_an_axis_changes_what_it_says(axis, nominal):
-    picture, state = start(perturb=f"{axis}={len(AXES[axis].levels)}")
-    assert (abs(picture - nominal[0]).sum(-1) > 10).any() or axis not in SEEN
-    assert (np.abs(state - nominal[1]).max() > 1e-4) == (axis in PHYSICAL)
+def test_an_axis_changes_what_it_says_and_nothing_else(axis, grasped):
+    """Of every level, and beyond the grasp: `python benchmarks/axes.py`."""
+    actions, nominal = grasped
+    seen = Difference.between(nominal, replay(actions, f"{axis}={len(AXES[axis].levels)}", TASK.name))
+    assert list(complaints(axis, seen)) == []
+    leaks = replace(seen, instruction=not seen.instruction), replace(seen, at_start={*BODIES}, later={*BODIES})
+    assert all([*complaints(axis, leak)] for leak in leaks)
+
+
+def test_the_page_of_what_axes_change_has_every_level():
+    page = (BENCHMARKS / "AXES.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| `(\w+)` \| (\d) \|", page, re.MULTILINE) == [(axis, str(level)) for axis, level in LEVELS]
+
+
+@pytest.mark.sim
+def test_late_actions_come_whole_and_in_order_and_until_then_the_hand_stays_open():
+    from lerobot_constructskill.sim.actions import Delay
+
+    delay = Delay(2, torch.device("cpu"), 2)
+    given = torch.rand(4, 2, 7)
+    due = torch.stack([delay.apply(action) for action in given])
+    assert torch.equal(due[2:], given[:2]) and (due[:2] == torch.tensor([0.0] * 6 + [1.0])).all()
+    delay.forget(torch.tensor([1]))
+    last = delay.apply(given[0])
+    assert torch.equal(last[0], given[2, 0]) and last[1].tolist() == [0.0] * 6 + [1.0]
+
+
+@pytest.mark.sim
+def test_latency_executes_the_same_actions_later_to_the_last_bit():
+    def reached(actions, **kwargs):
+        env = ConstructSkillEnv("brick_on_brick", render_backend="none", **kwargs)
+        env.reset(seed=1)
+        for action in actions:
+            env.step(action)
+        state = env.privileged_state()["joint_positions"]
+        env.close()
+        return state
+
+    moves = np.random.default_rng(0).uniform(-0.02, 0.02, (6, 4)).astype(np.float32)
+    still = np.array([[0, 0, 0, 1]] * 2, np.float32)
+    late = reached([*moves, *still], perturb="latency=2")
+    np.testing.assert_array_equal(late, reached([*still, *moves]))
+    assert (late != reached([*moves, *still])).any()
+
+
+@pytest.mark.sim
+def test_latency_is_of_one_control_mode():
+    from lerobot_constructskill.sim.scene import PickPlaceEnv
+
+    with pytest.raises(InputError, match="delays actions of pd_ee_delta_pose, not of pd_joint_pos"):
+        PickPlaceEnv(control_mode="pd_joint_pos", perturbation=Perturbation("latency=1"))
 
 
 @pytest.mark.sim
