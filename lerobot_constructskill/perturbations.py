@@ -2,13 +2,13 @@
 
 Level 0 is the task as it is. What is drawn once (camera, light, textures, size, distractors) follows from the axis
 and a seed alone; what it draws every episode (initial pose, sensor noise) from the episode's own seed. The latency
-draws nothing.
+draws nothing, and the seed chooses among the sentences of a level.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from lerobot_constructskill.contract import Task
+from lerobot_constructskill.contract import SHIPPED, SUITES, Task
 from lerobot_constructskill.errors import InputError
 
 
@@ -48,10 +48,24 @@ AXES = {
     "pose": Axis("standard deviation of the robot's initial joint angles in radians", (0.01, 0.02, 0.04), ("robot",)),
     "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16), _BOTH),
     "latency": Axis("steps by which an action is executed late", (1, 2, 4), ("execution",)),
+    "language": Axis(
+        "how far the sentence is from the task's own, and as control the sentence of another task",
+        (1, 2, 3, OTHER_TASK := 4),
+        ("instruction",),
+    ),
 }
 
 PICTURES = ("light", "texture", "sensor")
 """Axes that change every picture of every camera, and nothing that moves."""
+
+
+def _other(task: Task) -> str:
+    """The sentence of the next task of the suite, or of this package, that is asked otherwise."""
+    suites = (names for names in SUITES.values() if task.name in names)
+    names = next(suites, tuple(SHIPPED))
+    after = names.index(task.name) + 1 if task.name in names else 0
+    sentences = (SHIPPED[name].instruction for name in (*names[after:], *names[:after], *SHIPPED))
+    return next(sentence for sentence in sentences if sentence != task.instruction)
 
 
 @dataclass(frozen=True)
@@ -81,9 +95,21 @@ class Perturbation:
             raise InputError(f"Each axis has one level; '{self.levels}' names one twice.")
 
     def check(self, task: Task) -> None:
-        """Raise InputError where another size of brick is asked of a task without one."""
+        """Raise InputError where another size is asked of a task without a brick, or other words that it lacks."""
         if self.amount("size") and not task.is_brick:
             raise InputError(f"The axis 'size' is EN 771-1's tolerance of bricks; {task.name} has no brick.")
+        if OTHER_TASK > self.amount("language") >= max(1, len(task.rewordings)):
+            raise InputError(f"The row of {task.name} has no rewordings of level {self._level('language')}.")
+
+    def told(self, task: Task) -> Task:
+        """The row of `task` with the sentence that is said: its own, one that means the same, or another task's."""
+        level = self._level("language")
+        if not level:
+            return task
+        if level == OTHER_TASK:
+            return replace(task, instruction=_other(task))
+        said = task.rewordings[level]
+        return replace(task, instruction=said[self.seed % len(said)])
 
     def _pairs(self) -> list[tuple[str, str]]:
         parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]

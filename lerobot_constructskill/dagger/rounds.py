@@ -140,7 +140,8 @@ class Round(Node):
 
     def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[RunningEpisode]:
         agent = PolicyAgent.from_pretrained(checkpoint, **self.policy.learner.acting)
-        expert = make_expert(*self.base.config.rows, self.base.config.expert)
+        (task,) = self.base.config.rows
+        expert = make_expert(task, self.base.config.expert)
         drive = Drive(self.number, self.beta, self.patience)
         yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
 

@@ -113,7 +113,8 @@ class ConstructSkillEnv(gym.Env):
         action: ActionForm = TASK_ACTION,
     ):
         check_fields(ConstructSkillEnv.__init__, locals())
-        self._row, self._perturbation = perturbed_task(task, perturb, perturb_seed, action)
+        row, self._perturbation = perturbed_task(task, perturb, perturb_seed, action)
+        self._row = self._perturbation.told(row)
         self.task = task
         self.task_description = self._row.instruction
         self.obs_type = obs_type

@@ -15,6 +15,7 @@ import numpy as np
 from lerobot_constructskill.contract import FPS, OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
 from lerobot_constructskill.lerobot_internals import write_video
+from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.plans.measure import measured
 from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.progress import Progress, quiet
@@ -114,7 +115,8 @@ class _Lanes:
     ):
         self.agents, self.shared, self.sims, self.seeds, self.on_step = agents, shared, sims, seeds, on_step
         task = get_task(env_kwargs.get("task", "brick_to_bin"))
-        self.instruction, self.plan = task.instruction, task.plan and read_plan(task.plan)
+        perturbation = Perturbation(env_kwargs.get("perturb", ""), env_kwargs.get("perturb_seed", 0))
+        self.instruction, self.plan = perturbation.told(task).instruction, task.plan and read_plan(task.plan)
         self.running = {i: Rollout() for i in numbers}
         self.over: dict[int, Rollout] = {}
         self.actions: dict[int, np.ndarray] = {}

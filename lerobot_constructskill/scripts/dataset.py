@@ -166,8 +166,10 @@ def replay_episode(data: DataSet, episode: int) -> tuple[bool, float]:
     states = ["observation.state", *(["sim.joint_positions"] if data.has_joints else [])]
     recorded = np.concatenate([data.column(name)[span] for name in states], axis=1)
     outcomes = np.stack([data.column("next.reward")[span], data.column("next.success")[span]], axis=1)
-    task, how = data.task_of(episode).name, {"render_backend": "none", "action": config.action}
-    env = ConstructSkillEnv(task, config.obs_type, len(outcomes) + 1, config.light_robot, **how)
+    task, steps = data.task_of(episode).name, len(outcomes) + 1
+    env = ConstructSkillEnv(
+        task, config.obs_type, steps, config.light_robot, render_backend="none", action=config.action
+    )
     with closing(env):
         env.reset(seed=int(data.column("sim.seed")[span.start]))
         found, reached = [], []

@@ -112,7 +112,7 @@ def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tupl
     """Return what the heads see of every row; patch features that a readout learns from stay on the disk."""
     beside = [table[OBS_STATE]] if policy.config.use_state else []
     if policy.told:
-        beside.append(_told(policy.told, policy.config.sentences, table))
+        beside.append(_told(policy.told, table))
     side = (torch.cat(beside, dim=-1),) if beside else ()
     if policy.readout.learns:
         return open_patches(policy.patches_root), *side
@@ -120,9 +120,10 @@ def _head_inputs(policy: FrozenViTChunkPolicy, table: dict[str, Tensor]) -> tupl
     return torch.cat(pooled), *side
 
 
-def _told(told: Told, sentences: Sequence[Sequence[str]], table: dict[str, Tensor]) -> Tensor:
+def _told(told: Told, table: dict[str, Tensor]) -> Tensor:
     """The vectors of what every row is told, (N, D)."""
-    asked = [sentences[number][0] for number in table["task_index"].tolist()]
+    sentences = [*told.sentences]
+    asked = [sentences[number] for number in table["task_index"].tolist()]
     reworded = told.reworded(asked, table["index"].tolist())
     known = {sentence: place for place, sentence in enumerate(dict.fromkeys(reworded))}
     return told([*known])[[known[sentence] for sentence in reworded]]
