@@ -1,7 +1,8 @@
 """Instructions in, one vector out: what a policy is told, by a sentence encoder that never trains or by number."""
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
@@ -68,7 +69,7 @@ class SentenceEncoder:
         folder = _folder(name)
         try:
             self.tokenizer = AutoTokenizer.from_pretrained(folder, local_files_only=True)
-            with torch.random.fork_rng(devices=[]):
+            with torch.random.fork_rng(devices=[]), _silent():
                 self.model: nn.Module = AutoModel.from_pretrained(folder, local_files_only=True, dtype=torch.float32)
         except (OSError, ValueError) as error:
             raise InputError(f"'{name}' is no sentence encoder ({first_line(error)}).") from error
@@ -88,6 +89,19 @@ class SentenceEncoder:
                 mean = self.model(**tokens).last_hidden_state[0].mean(dim=0)
             self._known[sentence] = mean / mean.norm()
         return self._known[sentence]
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Silence what transformers reports of parameters that a file has in addition."""
+    from transformers.utils import logging
+
+    level = logging.get_verbosity()
+    logging.set_verbosity_error()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
 
 
 @cache
