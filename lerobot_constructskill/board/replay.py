@@ -2,7 +2,7 @@
 
 import os
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from itertools import batched, groupby
 from typing import Any
@@ -62,11 +62,7 @@ def replay_submission(submission: Submission, workers: int | None = None, sample
 
 def _execute(claims: Sequence[Claim], workers: int | None) -> list[str]:
     """The differences of some episodes, which are in the order of their settings."""
-    jobs = [
-        some
-        for _, own in groupby(claims, key=lambda claim: (claim.setting, claim.action))
-        for some in batched(own, TOGETHER)  # noqa: B911  the last one may be shorter
-    ]
+    jobs = jobs_of(claims)
     found: list[str] = []
     steps = sum(claim.steps for claim in claims)
     with open_workers(workers) as submit, Progress(total=steps, desc="replay", unit="step") as bar:
@@ -74,6 +70,15 @@ def _execute(claims: Sequence[Claim], workers: int | None) -> list[str]:
             found += future.result()
             bar.update(sum(claim.steps for claim in job))
     return found
+
+
+def jobs_of(claims: Iterable[Claim], together: int = TOGETHER) -> list[tuple[Claim, ...]]:
+    """Split episodes that are in the order of their settings into those that one simulator runs, one after another."""
+    return [
+        some
+        for _, own in groupby(claims, key=lambda claim: (claim.setting, claim.action))
+        for some in batched(own, together)  # noqa: B911  the last one may be shorter
+    ]
 
 
 def _reason(there: dict[str, str]) -> str:
@@ -114,16 +119,22 @@ def _replay(claims: Sequence[Claim]) -> list[str]:
         env.close()
 
 
-def difference(env: ConstructSkillEnv, claim: Claim) -> str | None:
-    """Execute a claim's actions and name what ends otherwise than claimed; None where all is as claimed."""
+def difference(env: ConstructSkillEnv, claim: Claim, see: Callable[[], None] = lambda: None) -> str | None:
+    """Execute a claim's actions and name what ends otherwise than claimed; None where all is as claimed.
+
+    Args:
+        see: called after the reset and after every step.
+    """
     episode, is_over = Episode(claim.evaluation_seed), False
     env.reset(seed=claim.evaluation_seed)
+    see()
     for action in claim.executed:
         if is_over:
             return f"{claim.label}: its episode ends after {episode.steps} steps, and its actions go on"
         _, _, terminated, truncated, info = env.step(action)
         episode.add(action, info)
         is_over = terminated or truncated
+        see()
     if not is_over:
         return f"{claim.label}: its actions end after {episode.steps} steps, and its episode goes on"
     said = claim.outcome
