@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS
+from lerobot_constructskill.board.recovered import Recovery, path_of, read_recovered
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission
 from lerobot_constructskill.board.verification import read_verification
 from lerobot_constructskill.errors import InputError, MissingError
@@ -44,12 +45,14 @@ class Entry:
         submission: as it was opened.
         level: one of `protocol.LEVELS`.
         verdict: result of its verification; empty if it was not verified.
+        recoveries: where its failed episodes were lost, by setting, training seed and start; empty if unknown.
     """
 
     name: str
     submission: Submission
     level: str
     verdict: dict[str, Any]
+    recoveries: dict[tuple[str, int, int], Recovery]
 
     @property
     def declaration(self) -> Declaration:
@@ -114,7 +117,8 @@ def _entry(root: Path, path: Path) -> Entry:
         raise InputError(f"the folder of an entry must be called by {NAME.meaning}.")
     submission = read_submission(path)
     verdict = read_verification(root / VERIFIED / f"{path.name}.json", submission.sha256)
-    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict)
+    recoveries = read_recovered(path_of(root, path.name), submission.sha256)
+    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, recoveries)
 
 
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:

@@ -22,8 +22,12 @@ TABLE, EXPORTS = "board.parquet", "exports"
 EVAL_INFO, EVAL_RESULTS = "eval_info.json", ".eval_results/constructskill.yaml"
 
 
+LOST = ("last_step", "last_step_extra", "lost", "is_hopeless")
+"""Columns of `recovered.Recovery`, null where an episode placed or was not searched."""
+
+
 def write_table(entries: Iterable[Entry], path: Path) -> None:
-    """Every episode of every entry, a row each, without its actions."""
+    """Every episode of every entry, a row each, without its actions, and where it was lost if it failed."""
     rows = [
         {
             "entry": entry.name,
@@ -33,6 +37,7 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
             "level": entry.level,
             "task": claim.task,
             **{name: getattr(claim, name) for name in SCHEMA.names if name != "actions"},
+            **{name: getattr(entry.recoveries.get(claim.key), name, None) for name in LOST},
         }
         for entry in entries
         for claim in entry.submission.claims

@@ -6,12 +6,14 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report.formats import percent, share_range
+from lerobot_constructskill.analysis.report.formats import p_value, percent, share_range, whole
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.films import films_there, write_films
+from lerobot_constructskill.board.losses import by_seed, by_setting, checked, depends_on_seed
 from lerobot_constructskill.board.protocol import BOARD_SUITES, CLASSES, LEVELS, RANKED_FROM
+from lerobot_constructskill.board.recovered import MEANING, PATIENCE, STRIDES
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import InputError, plural
 
@@ -69,6 +71,10 @@ def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
         classes=CLASSES,
         fewest=RANKED_FROM,
         cells=CELLS,
+        failed=[one for entry in own for one in entry.recoveries.values()],
+        meanings=MEANING,
+        patience=PATIENCE,
+        strides=STRIDES,
         films=lambda entry, column: films_there(entry, column, out),
         table=TABLE,
         day=day,
@@ -107,4 +113,6 @@ def _render(template: str, **context) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"percent": percent, "share_range": share_range, "plural": plural, "grid": grid}
+    environment.filters |= {"by_setting": by_setting, "by_seed": by_seed, "checked": checked, "p_value": p_value}
+    environment.filters |= {"depends_on_seed": depends_on_seed, "number": whole}
     return environment.get_template(template).render(**context)

@@ -70,3 +70,8 @@ def error_range(estimate: Estimate | None) -> str:
 def millimetres(value: float | None) -> str:
     """A length in mm: "1.4"."""
     return "–" if value is None else f"{value:.1f}"
+
+
+def whole(value: float | None) -> str:
+    """A number without decimals: "14"."""
+    return "–" if value is None else f"{value:.0f}"

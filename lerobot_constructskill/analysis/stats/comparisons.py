@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.stats import beta, boschloo_exact, fisher_exact, permutation_test
+from scipy.stats import PermutationMethod, beta, boschloo_exact, chi2_contingency, fisher_exact, permutation_test
+from scipy.stats.contingency import crosstab
 from statsmodels.stats.multitest import multipletests
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, newcombe
@@ -188,3 +189,16 @@ def _permuted(statistic: Callable, a: np.ndarray, b: np.ndarray) -> float:
 
 def _table(a: Counts, b: Counts) -> list[list[int]]:
     return [[a.met, b.met], [a.seeds - a.met, b.seeds - b.met]]
+
+
+def association(groups: Sequence, kinds: Sequence) -> float:
+    """P-value of a permutation test whether what kind something is depends on its group, by the chi-squared statistic.
+
+    Args:
+        groups, kinds: of each thing; of one group or one kind alone, nothing can depend.
+    """
+    counts = crosstab(groups, kinds).count
+    if 1 in counts.shape:
+        return 1.0
+    method = PermutationMethod(n_resamples=PERMUTATIONS, rng=np.random.default_rng(0))
+    return float(chi2_contingency(counts, correction=False, method=method).pvalue)
