@@ -34,6 +34,7 @@ NOT_RUN = {
     "CONSTRUCTSKILL_RECORD=": "a submission needs every start: tests/board/test_commands.py makes one of two",
     "constructskill-submit": "of that evaluation",
     "constructskill-verify": "of that submission",
+    "constructskill-recover": "an hour for the committed board: tests/board/test_recover.py searches two episodes",
     "constructskill-dagger": "trains between rounds: tests/dagger/test_dagger.py runs it whole and small",
     "constructskill-check --root=outputs/driven": "of its set",
     "make ": "ten minutes to hours, of the commands that are run here and in the other tests",
