@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from lerobot_constructskill.artifacts.code import code_of
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.artifacts.tables import Parquet
+from lerobot_constructskill.artifacts.tables import VERSIONS, Parquet
 from lerobot_constructskill.envs.recording import deciding
 
 RECOVERED = "recovered"
@@ -141,10 +141,16 @@ def read_recovered(path: Path, submission: str) -> dict[tuple[str, int, int], Re
 
 
 def is_current(path: Path, submission: str) -> bool:
-    """Whether a table is there that this code would make again of this submission, on whatever make of processor."""
+    """Whether a table is there that this code would make again of this submission, on whatever make of processor.
+
+    Raises:
+        InputError: the file is no such table.
+    """
     if not path.exists():
         return False
-    said = pq.read_schema(path).metadata or {}
-    there, here = json.loads(said.get(b"made_with", b"{}")), made_with()
-    same = {name: there.get(name) for name in here if name != "processor"}
-    return said.get(b"submission") == submission.encode() and same == {name: here[name] for name in same}
+    said = TABLE.read(path).schema.metadata or {}
+    there = VERSIONS.parse(said.get(b"made_with", b"{}").decode(), f"made_with in '{path}'")
+    here = made_with()
+    return said.get(b"submission") == submission.encode() and all(
+        there.get(name) == version for name, version in here.items() if name != "processor"
+    )
