@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from commands import call
 from lerobot.datasets import LeRobotDataset
 from torch.utils.data import DataLoader
 from toy import record_toy
@@ -19,9 +20,12 @@ from lerobot_constructskill.dataset.split import split_of
 from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.demos.language import SUBTASKS, objects_of, persistent_rows
 from lerobot_constructskill.demos.metadata import CONTRACT
+from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.features.encode import _write_copy
-from lerobot_constructskill.lerobot_internals import lerobot_collate_fn
+from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT, lerobot_collate_fn
+from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.policies.frozen_vit.feature_sets import feature_key
+from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.references import ReplayAgent
 from lerobot_constructskill.training.recipe import held_out_of
 
@@ -119,6 +123,28 @@ def test_a_feature_set_says_of_which_task_its_episodes_are(pristine, tmp_path):
     column = np.zeros((dataset.num_frames, 2), np.float32)
     _write_copy(dataset, "base", {feature_key("base"): column}, [], {}, "local/features", tmp_path / "set")
     assert held_out_of(LeRobotDataset("local/features", root=tmp_path / "set"), 2) == [1, 4, 7]
+
+
+@pytest.mark.slow
+def test_stock_act_trains_on_it_and_its_errors_are_measured_in_seven_numbers(pristine, tmp_path):
+    small = ["dim_model=32", "n_heads=2", "dim_feedforward=32", "n_encoder_layers=1", "latent_dim=8", "chunk_size=10"]
+    flags = [*small, "n_action_steps=10", "pretrained_backbone_weights=null", "push_to_hub=false", "device=cpu"]
+    call(
+        "lerobot-train",
+        f"--dataset.root={pristine}",
+        "--dataset.repo_id=local/toy",
+        *("--policy.type=act", *(f"--policy.{flag}" for flag in flags)),
+        *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", f"--output_dir={tmp_path / 'act'}"),
+    )
+    checkpoint = tmp_path / "act" / LAST_CHECKPOINT
+    assert PolicyAgent.from_pretrained(checkpoint).action == "full"
+    sources = [f"--root={pristine}", "--repo_id=local/toy", "--episodes=[8]"]
+    call("constructskill-offline", *sources, f"--policies=['{checkpoint}']", f"--out={tmp_path / 'offline'}")
+    (row,) = json.loads((tmp_path / "offline" / "offline.json").read_text())
+    assert row["rmse_rotation_rad"] is not None and row["episodes"] == "8"
+    call("constructskill-fit-noise", *sources, f"--policy_path={checkpoint}", f"--out={tmp_path / 'dart.yaml'}")
+    fitted = parse(GenerateConfig, ["--repo_id=local/dart"], tmp_path / "dart.yaml")
+    assert (fitted.task, fitted.action) == (",".join(SUITES["bins"]), "full")
 
 
 def episodes(change):

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from datasets import Dataset
 
 from lerobot_constructskill.artifacts.digests import data_sha256
 from lerobot_constructskill.dataset import hub
@@ -212,7 +213,7 @@ def test_features_of_another_encoder_are_not_scored(checkpoint, feature_set, tmp
 )
 def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint, feature_set, tmp_path, monkeypatch):
     """Not by default: whoever names an episode may have a reason."""
-    monkeypatch.setattr(hub, "held_out", lambda episodes: EPISODES)  # every fourth of eight
+    monkeypatch.setattr(hub, "held_out_of", lambda dataset: EPISODES)  # every fourth of eight
     trained = shutil.copytree(checkpoint, tmp_path / "checkpoint")
     (trained / TRAIN_CONFIG).write_text(json.dumps({"dataset": {"repo_id": "local/random"} | told}))
     asked = OfflineConfig(policies=[str(trained)], repo_id="local/random", root=feature_set.root, out=tmp_path)
@@ -224,7 +225,8 @@ def test_what_a_checkpoint_was_trained_on_is_not_held_out(told, seen, checkpoint
 def of_tasks(*tasks_and_numbers) -> SimpleNamespace:
     """The metadata of a set with so many episodes of each task, one after another."""
     pairs = zip(tasks_and_numbers[::2], tasks_and_numbers[1::2], strict=True)
-    return SimpleNamespace(episodes=[{"tasks": [task]} for task, number in pairs for _ in range(number)])
+    rows = [{"tasks": [task]} for task, number in pairs for _ in range(number)]
+    return SimpleNamespace(episodes=Dataset.from_list(rows))
 
 
 def test_lerobot_holds_out_of_each_task(tmp_path):
