@@ -17,7 +17,7 @@ from lerobot_constructskill.contract import CAMERAS, FPS, OBS_TYPES, TASKS
 from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos import shards
-from lerobot_constructskill.demos.columns import SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.columns import LANGUAGE, SIDECAR, dagger_features, demonstration_features
 from lerobot_constructskill.demos.metadata import CONTRACT, file_hashes, modality
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError
@@ -39,7 +39,7 @@ def card(data):
 
 def test_every_column_of_every_task_has_its_meaning():
     for task in TASKS.values():
-        features = dagger_features(task, ["base", "wrist"])
+        features = dagger_features(task, ["base", "wrist"]) | LANGUAGE
         assert set(features) - {camera.key for camera in CAMERAS.values()} == set(MEANINGS)
 
 

@@ -13,10 +13,12 @@ import pytest
 from commands import call
 
 from lerobot_constructskill.artifacts.digests import data_sha256
+from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.dataset.card import card_facts, render
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.demos.columns import JOINT_COLUMNS, SIDECAR
+from lerobot_constructskill.demos.language import annotate
 from lerobot_constructskill.errors import InputError
 
 VIDEO = "videos/observation.images.base/chunk-000/file-000.mp4"
@@ -67,6 +69,17 @@ def late_video(root):
         edges = [name for name in table.columns if name.endswith(("/from_timestamp", "/to_timestamp"))]
         table[edges] += 4e-4
         table.to_parquet(path)
+
+
+def misread(root):
+    """Annotated, but some frames lack the last subtask of their episode."""
+    metadata(SIDECAR, lambda facts: facts["generator"].update(annotate=True))(root)
+    annotate(root, [TASKS["brick_to_bin"]] * 9)
+    path = root / "data/chunk-000/file-000.parquet"
+    table = pd.read_parquet(path)
+    said = table["language_persistent"].to_list()
+    said[:9] = [rows[:-1] for rows in said[:9]]
+    table.assign(language_persistent=said).to_parquet(path)
 
 
 AV1 = ("libsvtav1", {"crf": "18", "preset": "12"})
@@ -227,6 +240,7 @@ CORRUPTIONS = {
         "Provenance",
         "of the settings it is",
     ),
+    "annotations of other phases": (misread, "Language", "not what the phases say in 9 frames"),
     "no modality": (lambda root: (root / "meta/modality.json").unlink(), "Provenance", "modality.json"),
 }
 
