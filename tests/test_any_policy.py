@@ -146,6 +146,7 @@ def test_the_study_of_vlas_runs_whole(smolvla_base, folder):
     fields = read_fields(find("study", "vla"))
     vla = fields["variants"]["smolvla"]
     vla["policy"] |= {"device": "cpu", "pretrained_path": str(smolvla_base), "num_steps": 2}
+    vla["policy"] |= {"vlm_model_name": str(folder / "vlm"), "resize_imgs_with_padding": [64, 64]}
     fields["variants"] = {"smolvla": vla | {"seeds": 1, "training": {"epochs": 1}}}
     fields["analysis"]["labels"].pop("told")
     few = "suite/orders --episodes=1 --video=av1"

@@ -140,8 +140,8 @@ class Widened:
         return self.expert.start(state)
 
     def act(self, state: PrivilegedState, progress: ExpertProgress) -> tuple[np.ndarray, Phase, ExpertProgress | None]:
-        action, phase, progress = self.expert.act(state, progress)
-        return self._wide(action), phase, progress
+        action, phase, after = self.expert.act(state, progress)
+        return self._wide(action), phase, after
 
     def advise(self, state: PrivilegedState) -> Advice:
         advice = self.expert.advise(state)

@@ -59,15 +59,13 @@ def objects_of(task: Task) -> list[str]:
     return [f"{kind} {n}" if kinds.count(kind) > 1 else kind for kind, n in zip(kinds, ordinal, strict=True)]
 
 
-def persistent_rows(
-    task: Task, phases: Sequence[str], placements: Sequence[float], times: Sequence[float]
-) -> list[dict[str, Any]]:
+def persistent_rows(task: Task, phases: np.ndarray, placements: np.ndarray, times: np.ndarray) -> list[dict[str, Any]]:
     """What holds in an episode, in the order of time.
 
     Args:
-        phases, placements, times: the columns `phase`, `sim.placement` and `timestamp` of its frames.
+        phases, placements, times: the columns `phase`, `sim.placement` and `timestamp` of its frames, (T,) each.
     """
-    objects, starts = objects_of(task), [0, *(np.flatnonzero(np.array(phases[1:]) != np.array(phases[:-1])) + 1)]
+    objects, starts = objects_of(task), [0, *(np.flatnonzero(phases[1:] != phases[:-1]) + 1)]
     told = [task.instruction, *next(iter(task.rewordings), ())]
     rows = [_row("user", words, "task_aug", times[0]) for words in told]
     for start, stop in zip(starts, [*starts[1:], len(phases)], strict=True):
@@ -95,8 +93,8 @@ def annotate(folder: Path, tasks: Sequence[Task]) -> None:
         table = table.append_column(EVENTS, pa.array([[]] * len(rows), pa.list_(EVENT)))
         write_table_one_row_group_per_episode(table, path)
     info = DATA_SET.read(folder / INFO)
-    info["features"] |= LANGUAGE
-    (folder / INFO).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    text = json.dumps(info | {"features": {**info["features"], **LANGUAGE}}, indent=4, ensure_ascii=False)
+    (folder / INFO).write_text(text, encoding="utf-8")
 
 
 READ = ("episode_index", "phase", "sim.placement", "timestamp")

@@ -108,8 +108,8 @@ def test_every_task_names_its_objects(task):
 
 
 def test_a_subtask_of_a_wall_names_the_element_that_the_expert_has_in_hand():
-    phases = [*(["PREGRASP"] * 2), "GRASP", *(["RELEASE"] * 2), *(["PREGRASP"] * 2)]
-    rows = persistent_rows(TASKS["lintel_on_posts"], phases, [0, 0, 0, 0, 1, 1, 1], np.arange(7) / 20)
+    phases = np.array([*(["PREGRASP"] * 2), "GRASP", *(["RELEASE"] * 2), *(["PREGRASP"] * 2)])
+    rows = persistent_rows(TASKS["lintel_on_posts"], phases, np.array([0, 0, 0, 0, 1, 1, 1]), np.arange(7) / 20)
     assert [(row["content"], round(20 * row["timestamp"])) for row in rows if row["style"] == "subtask"] == [
         ("Move the open gripper above the post 1.", 0),
         ("Close the gripper on the post 1.", 2),
