@@ -294,13 +294,11 @@ class ConstructSkillEnv(gym.Env):
         # Without the gaps of a fourth channel a picture is sent to another process faster. Channel by channel it is
         # copied faster than pixel by pixel.
         seen = {"pixels": {name: np.stack([*np.moveaxis(rgb, -1, 0)], axis=-1) for name, rgb in pictures.items()}}
-        if self.obs_type != "pixels":
-            seen["agent_pos"] = self._agent_states()
-        return seen
+        return seen if self.obs_type == "pixels" else seen | {"agent_pos": self._agent_states()}
 
     def _agent_states(self) -> np.ndarray:
         """The state of every copy, (num_copies, 8) or (num_copies, 11) float32."""
-        scene = self.started()
+        scene: Any = self.started()
         parts = [scene.agent_state(), *([scene.force()] if state_names(self.obs_type) != STATE_NAMES else [])]
         return np.concatenate([part.cpu().numpy() for part in parts], axis=1).astype(np.float32)
 

@@ -27,7 +27,7 @@ PUSHING = STILL + np.array([0.0123, 0, 0, 0], np.float32)
 
 
 class Pushed(gym_env.ConstructSkillEnv):
-    """An environment in which one action puts the object beside the robot's foot; the expert never takes that action."""
+    """An environment in which one action puts the object beside the robot's foot; the expert never takes it."""
 
     def step(self, action):
         if np.array_equal(action, PUSHING):
