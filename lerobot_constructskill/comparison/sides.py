@@ -221,6 +221,15 @@ def read_study(root: Path, arm: str) -> Side:
     )
 
 
+def settings_of(source: Source) -> list[str]:
+    """The settings of a study in which a source's variant ran, in the study's order. Raises as `read_study` does."""
+    root, variant = source.folders[0], source.arm.rpartition("/")[2]
+    check_folder(root)
+    rows = read_rows(root / ROWS)
+    ran = rows[(rows["variant"] == variant) & (rows["error_kind"].fillna("") != NOT_RUN)]
+    return [str(name) for name in ran["setting"].unique()]
+
+
 def _placements_of_rows(rows: pd.DataFrame) -> Placements | None:
     if rows["error_kind"].notna().any():
         return None

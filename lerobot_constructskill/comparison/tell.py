@@ -9,6 +9,8 @@ from lerobot_constructskill.analysis.stats.comparisons import ALIKE_WITHIN, Conc
 from lerobot_constructskill.analysis.stats.judgement import Judgement
 from lerobot_constructskill.analysis.stats.power import MOST, TARGET
 from lerobot_constructskill.comparison.match import MatchedSides
+from lerobot_constructskill.comparison.over_tasks import OverTasks
+from lerobot_constructskill.comparison.sides import Side
 from lerobot_constructskill.errors import plural
 
 CONCLUSIONS = {
@@ -32,11 +34,33 @@ def tell(matched: MatchedSides, alpha: float) -> str:
     return "\n\n".join(filter(None, paragraphs))
 
 
-def as_json(matched: MatchedSides) -> str:
+def tell_over_tasks(over: OverTasks, alpha: float) -> str:
+    """The output for several tasks: each in a line, then the mean over tasks of every seed."""
+    one = next(iter(over.tasks.values()))
+    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", "", f"{'':24}{'A, mean of seeds':<18}B, mean of seeds"]
+    for name, matched in over.tasks.items():
+        lines.append(f"{name:<24}{matched.judgement.mean_a.value:<18.1%}{matched.judgement.mean_b.value:.1%}")
+    means = over.judgement.mean_a, over.judgement.mean_b
+    shares = [f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})" for mean in means]
+    lines += [f"{'mean over tasks':<24}{shares[0]:<18}  {shares[1]}", ""]
+    for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
+        lines.append(f"{letter}, mean over tasks of each seed, %: {' '.join(f'{100 * rate:.0f}' for rate in rates)}")
+    paragraphs = ("\n".join(lines), _conclusion(over.judgement, alpha), _power(over.judgement, alpha), _covered(one))
+    return "\n\n".join(
+        [*filter(None, paragraphs), "Each seed counts once; episodes of different tasks are not pooled."]
+    )
+
+
+def _every(side: Side) -> str:
+    return f"{side.name.partition(':')[0]}:*/{side.name.rpartition('/')[2]}: {side.kind}"
+
+
+def as_json(matched: MatchedSides | OverTasks) -> str:
     """Every number as JSON; an estimate is [value, low, high], and infinity, which JSON does not have, is null."""
     values = asdict(matched)
-    if matched.judgement.seeds_needed == inf:
-        values["judgement"]["seeds_needed"] = None
+    for one in (values, *values.get("tasks", {}).values()):
+        if one["judgement"]["seeds_needed"] == inf:
+            one["judgement"]["seeds_needed"] = None
     return json.dumps(values, indent=2) + "\n"
 
 
@@ -70,11 +94,13 @@ def _sides(matched: MatchedSides) -> str:
 
 def _conclusion(judgement: Judgement, alpha: float) -> str:
     value, low, high = (100 * share for share in judgement.difference)
+    spreads = f"A {100 * judgement.spread_a:.1f}, B {100 * judgement.spread_b:.1f} points"
     interval = f"{100 * (1 - alpha):g} % interval {low:+.0f} to {high:+.0f}"
     return (
         f"{CONCLUSIONS[judgement.conclusion]}\n"
         f"A - B: {value:+.1f} points ({interval}); p = {p_value(judgement.p_value)}, permutation of seeds.\n"
         f"Seeds that placed at least once: p = {p_value(judgement.counts_p_value)}, Boschloo's exact test.\n"
+        f"Spread over seeds: standard deviation {spreads}; p = {p_value(judgement.spread_p_value)}.\n"
         "The interval makes no assumption about how seeds vary, so it is wider than the tests suggest."
     )
 

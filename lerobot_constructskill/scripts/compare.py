@@ -26,7 +26,7 @@ class CompareConfig(Checked):
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
     seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
     output folders of lerobot-train, which are evaluated where the other side was; or recordings of
-    $CONSTRUCTSKILL_RECORD.
+    $CONSTRUCTSKILL_RECORD. Two variants are compared over all tasks of a study as results/orders:*/told.
 
     Args:
         a: the first side, the candidate.
@@ -82,8 +82,9 @@ def compare(config: CompareConfig) -> str:
     """
     from lerobot_constructskill.artifacts.folders import staged
     from lerobot_constructskill.comparison.match import Asked, match
+    from lerobot_constructskill.comparison.over_tasks import is_over_tasks, match_over_tasks
     from lerobot_constructskill.comparison.sides import find
-    from lerobot_constructskill.comparison.tell import as_json, tell
+    from lerobot_constructskill.comparison.tell import as_json, tell, tell_over_tasks
 
     a, b = find(config.a), find(config.b)
     with staged(config.out) if config.out else nullcontext() as folder:
@@ -94,11 +95,13 @@ def compare(config: CompareConfig) -> str:
             kept_in = folder and folder / ("a" if source is a else "b")
             return evaluate(source, env, starts, config.together, config.device, kept_in)
 
-        matched = match(a, b, Asked(config.env, config.seed, config.episodes), evaluated, config.alpha)
+        asked = Asked(config.env, config.seed, config.episodes)
+        over_tasks = is_over_tasks(a, b)
+        matched = (match_over_tasks if over_tasks else match)(a, b, asked, evaluated, config.alpha)
         if folder:
             folder.mkdir(exist_ok=True)
             (folder / "comparison.json").write_text(as_json(matched), encoding="utf-8")
-    told = tell(matched, config.alpha)
+    told = (tell_over_tasks if over_tasks else tell)(matched, config.alpha)
     if config.fail_if == matched.judgement.conclusion:
         say(told)
         raise SystemExit(FAILED)

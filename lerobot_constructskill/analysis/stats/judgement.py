@@ -11,6 +11,7 @@ from lerobot_constructskill.analysis.stats.comparisons import (
     boschloo,
     conclude,
     mean_p_value,
+    spread_p_value,
 )
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count
@@ -28,6 +29,8 @@ class Judgement:
         p_value: p-value of the difference of means, from a permutation of seeds; it decides the conclusion.
         smallest_p_value: smallest p-value that so many seeds can give.
         counts_p_value: p-value of the counts, from Boschloo's exact test.
+        spread_a, spread_b: standard deviation of the share over seeds (divisor n), in [0, 0.5].
+        spread_p_value: p-value of the difference of these, from a permutation of seeds.
         conclusion: from `p_value` and `difference`.
         visible: smallest difference of means that 80 % of comparisons with so many seeds find, if seeds vary as these
             do; None if they do not vary, or a side has one seed.
@@ -43,6 +46,9 @@ class Judgement:
     p_value: float
     smallest_p_value: float
     counts_p_value: float
+    spread_a: float
+    spread_b: float
+    spread_p_value: float
     conclusion: Conclusion
     visible: float | None
     seeds_needed: float | None
@@ -67,6 +73,9 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         p_value=p_value,
         smallest_p_value=smallest_p_value(len(a), len(b)),
         counts_p_value=boschloo(counts_a, counts_b),
+        spread_a=float(np.std(a)),
+        spread_b=float(np.std(b)),
+        spread_p_value=spread_p_value(a, b),
         conclusion=conclude(p_value, apart, alpha),
         visible=detectable_mean_difference(deviation, len(a), len(b), alpha) if deviation else None,
         seeds_needed=seeds_needed_for_mean(abs(apart.value), deviation, alpha) if deviation else None,
