@@ -49,10 +49,9 @@ AXES = {
     "sensor": Axis("standard deviation of the pixel noise, of 255", (4, 8, 16), _BOTH),
     "latency": Axis("steps by which an action is executed late", (1, 2, 4), ("execution",)),
     "language": Axis(
-        "how far the sentence is from the task's own, and as control the sentence of another task",
-        (1, 2, 3, OTHER_TASK := 4),
-        ("instruction",),
+        "how far the sentence is from the task's own, with the same meaning", (1, 2, 3), ("instruction",)
     ),
+    "wrong_task": Axis("whether the sentence is that of another task, as control", (1,), ("instruction",)),
 }
 
 PICTURES = ("light", "texture", "sensor")
@@ -98,18 +97,17 @@ class Perturbation:
         """Raise InputError where another size is asked of a task without a brick, or other words that it lacks."""
         if self.amount("size") and not task.is_brick:
             raise InputError(f"The axis 'size' is EN 771-1's tolerance of bricks; {task.name} has no brick.")
-        if OTHER_TASK > self.amount("language") >= max(1, len(task.rewordings)):
+        if self.amount("language") >= max(1, len(task.rewordings)):
             raise InputError(f"The row of {task.name} has no rewordings of level {self._level('language')}.")
 
     def told(self, task: Task) -> Task:
         """The row of `task` with the sentence that is said: its own, one that means the same, or another task's."""
-        level = self._level("language")
-        if not level:
-            return task
-        if level == OTHER_TASK:
+        if self.amount("wrong_task"):
             return replace(task, instruction=_other(task))
-        said = task.rewordings[level]
-        return replace(task, instruction=said[self.seed % len(said)])
+        if level := self._level("language"):
+            said = task.rewordings[level]
+            return replace(task, instruction=said[self.seed % len(said)])
+        return task
 
     def _pairs(self) -> list[tuple[str, str]]:
         parts = [part.partition("=") for part in self.levels.split(",") if part.strip()]
