@@ -66,6 +66,8 @@ ARROWS = {
     "board": ("contract", "perturbations"),
     "board.submission": ("artifacts", "contract", "envs.actions", "envs.recording", "perturbations"),
     "board.verification": ("artifacts", "envs.recording"),
+    "board.copies": ("contract", "envs.actions", "envs.recording"),
+    "board.explained": ("analysis.stats", "contract", "perturbations"),
     "board.from_recordings": ("envs.recording", "study.rows"),
     "board.replay": ("artifacts", "envs"),
     "board.rerun": ("analysis.stats", "contract"),

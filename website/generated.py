@@ -126,7 +126,8 @@ def help_of(name: str, target: str) -> str:
 def board(root: Path) -> dict[str, str | bytes]:
     """The pages and the table that `constructskill-board` makes, and a page that leads to them."""
     with TemporaryDirectory() as folder:
-        made = [*write_board(root / "board", Path(folder)), Path(folder) / TABLE]
+        pages = write_board(root / "board", Path(folder), documentation="../docs/leaderboard.html")
+        made = [*pages, Path(folder) / TABLE]
         files: dict[str, str | bytes] = {f"board/{path.name}": path.read_bytes() for path in made}
     suites = "\n".join(
         f"- [`{name}`](../board/{name}.html): {', '.join(BOARD_SUITES[name].settings)}" for name in BOARD_SUITES

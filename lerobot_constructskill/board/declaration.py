@@ -5,11 +5,14 @@ from typing import Annotated
 
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PHYSICS, BoardSetting, class_of
 from lerobot_constructskill.bounds import UNSEEN, Among, Checked, NotEmpty, Pattern, Seed, check
-from lerobot_constructskill.contract import FULL_ACTION, OBS_TYPES, TASKS
+from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP, FULL_ACTION, OBS_TYPES, TASKS
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Yaml
 
 VERSION = 1
+
+UNSEEING = ", none rendering"
+"""End of a backend that shows no pictures."""
 
 MOST_EPISODES, MOST_SETTINGS, MOST_BYTES = 50_000, 32, 1 << 30
 """Episodes and settings of a submission, and bytes of its actions unpacked."""
@@ -73,6 +76,22 @@ class About(Checked):
 
 
 @dataclass(frozen=True)
+class Trained(Checked):
+    """What a recipe made, with which training again is compared.
+
+    Args:
+        recipe_sha256: hash of the recipe.
+        weights: setting to the SHA-256 of each training seed's weights, in the order of `training_seeds`; None for one
+            that failed.
+        made_with: packages, rooms of our code and processors, each with its version.
+    """
+
+    recipe_sha256: Hash
+    weights: dict[str, list[Hash | None]]
+    made_with: dict[Line, Line]
+
+
+@dataclass(frozen=True)
 class Declaration:
     """The content of submission.yaml.
 
@@ -84,6 +103,7 @@ class Declaration:
         backend: what simulated and rendered.
         versions: packages that decide what an action does, and the make of the processor, each with its version.
         episodes_sha256: hash of episodes.parquet.
+        trained: what its recipe made; None without a recipe.
         version: of this format.
 
     Raises:
@@ -97,6 +117,7 @@ class Declaration:
     backend: Line
     versions: dict[Line, Line]
     episodes_sha256: Hash
+    trained: Trained | None = None
     version: Annotated[int, Among((VERSION,))] = VERSION
 
     def __post_init__(self):
@@ -107,6 +128,14 @@ class Declaration:
             self._check_setting(name, setting)
         if len(set(self.training_seeds)) < len(self.training_seeds):
             raise InputError("training_seeds must differ.")
+        weights = self.trained.weights if self.trained else dict.fromkeys(self.settings, self.training_seeds)
+        if {name: len(own) for name, own in weights.items()} != dict.fromkeys(self.settings, len(self.training_seeds)):
+            raise InputError("trained.weights must name the weights of each training seed in each setting.")
+        if self.about.is_policy and self.backend.endswith(UNSEEING):
+            raise InputError(
+                f"about.observes is {self.about.observes}, but the backend '{self.backend}' shows no pictures: "
+                "evaluate the policy with a renderer."
+            )
         if self.episodes > MOST_EPISODES or self.most_bytes > MOST_BYTES:
             raise InputError(
                 f"A submission has at most {MOST_EPISODES:,} episodes, and {MOST_BYTES:,} bytes of actions."
@@ -120,6 +149,11 @@ class Declaration:
         own = setting.task, setting.perturbation
         if own != (meant := called.get(name, own)):
             raise InputError(f"The setting {name} must be of the task {''.join(meant)}, or have another name than it.")
+        if setting.starts.start < DEMO_SEED_STOP and setting.starts.stop > DEMO_SEED_START:
+            raise InputError(
+                f"The setting {name} has starts of demonstrations, which policies are trained on: evaluate it from "
+                f"starts below {DEMO_SEED_START:,}."
+            )
         control = replace(setting, perturb="", perturb_seed=0).compared
         if control not in [one.compared for one in self.settings.values()]:
             raise InputError(

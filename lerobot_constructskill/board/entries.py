@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
+from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.declaration import NAME, Declaration
-from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS
+from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS, PublicValue
 from lerobot_constructskill.board.recovered import Recovery, path_of, read_recovered
+from lerobot_constructskill.board.rerun import check_later
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission
-from lerobot_constructskill.board.verification import read_verification
+from lerobot_constructskill.board.verification import different, read_verification
 from lerobot_constructskill.errors import InputError, MissingError
 
 ENTRIES, VERIFIED = "entries", "verified"
@@ -69,6 +71,17 @@ class Entry:
         return is_checked and not self.is_reference and len(self.declaration.training_seeds) >= RANKED_FROM
 
     @property
+    def other_versions(self) -> list[str]:
+        """What it was made with, where its replay had something else."""
+        made = different(self.declaration.versions, self.verdict.get("versions", {}))
+        return [f"{name} {there}, verified with {here}" for name, (there, here) in made.items()]
+
+    @property
+    def rerun_value(self) -> PublicValue | None:
+        """The public value that the starts of its re-run came from."""
+        return PublicValue.of(self.verdict["rerun"]["value"]) if "rerun" in self.verdict else None
+
+    @property
     def missing_seeds(self) -> int:
         """How many of the protocol's training seeds it lacks."""
         return 0 if self.is_reference else len({*TRAINING_SEEDS} - {*self.declaration.training_seeds})
@@ -109,7 +122,53 @@ def read_entries(root: Path) -> tuple[list[Entry], list[str]]:
                 entries.append(_entry(root, path))
             except (InputError, MissingError) as error:
                 refused.append(f"Entry {path.name!a}: {error}")
-    return entries, refused
+    entries, copies = _without_copies(entries)
+    return entries, refused + copies
+
+
+def check_original(path: Path) -> None:
+    """Refuse a submission that lies in a board's folder and repeats another entry, or nearly.
+
+    Raises:
+        InputError: it does, and the other one was verified before it.
+    """
+    path = path.resolve()
+    if path.parent.name == ENTRIES:
+        said = f"Entry {path.name!a}: "
+        refused = [one.removeprefix(said) for one in read_entries(path.parents[1])[1] if one.startswith(said)]
+        if refused:
+            raise InputError(refused[0])
+
+
+def _without_copies(entries: list[Entry]) -> tuple[list[Entry], list[str]]:
+    """Entries without those that repeat one that was verified before them, and a sentence for each of these."""
+    kept: list[Entry] = []
+    refused = []
+    for entry in sorted(entries, key=lambda one: (one.level == CLAIMED, one.verdict.get("date", ""), one.name)):
+        if said := next(filter(None, (_repeated(entry, other) for other in kept)), None):
+            refused.append(f"Entry {entry.name!a}: {said}")
+        else:
+            kept.append(entry)
+    return sorted(kept, key=lambda one: one.name), refused
+
+
+def _repeated(entry: Entry, other: Entry) -> str | None:
+    """What an entry has of another one, as a sentence; None where it has nothing of it.
+
+    Whoever submits a policy to two suites may have the same episodes in both, of the same training seeds.
+    """
+    if entry.submission.sha256 == other.submission.sha256:
+        return f"it is the entry {other.name} under another name."
+    if entry.is_reference and other.is_reference:
+        return None
+    mine, theirs = entry.declaration, other.declaration
+    is_twice = mine.about.submitter == theirs.about.submitter and mine.suite != theirs.suite
+    pair = near_copy(
+        entry.submission.claims,
+        other.submission.claims,
+        lambda one, there: is_twice and one.training_seed == there.training_seed,
+    )
+    return pair and f"{pair[0].label} has the actions of the entry {other.name}, {pair[1].label}, or nearly."
 
 
 def _entry(root: Path, path: Path) -> Entry:
@@ -117,6 +176,8 @@ def _entry(root: Path, path: Path) -> Entry:
         raise InputError(f"the folder of an entry must be called by {NAME.meaning}.")
     submission = read_submission(path)
     verdict = read_verification(root / VERIFIED / f"{path.name}.json", submission.sha256)
+    if "rerun" in verdict:
+        check_later(PublicValue.of(verdict["rerun"]["value"]), str(verdict["date"]))
     recoveries = read_recovered(path_of(root, path.name), submission.sha256)
     return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, recoveries)
 

@@ -1,7 +1,9 @@
 """The protocol's numbers, which have their one home here: suites, starts, training seeds, limits."""
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from hashlib import sha256
 from typing import Annotated, Any
 
@@ -42,15 +44,22 @@ CONTROL = "control"
 PHYSICS = "physx_cpu"
 """The only physics that a result is replayed on. PhysX on a GPU rounds otherwise and is never mixed with it."""
 
+DRAND_START, DRAND_PERIOD = 1_692_803_367, 3
+"""Seconds since 1970 of the first round of drand's chain quicknet, and seconds from one round to the next."""
+
+DRAND = "https://api.drand.sh/52db9ba70e0cc0f6eaf7803dd07447a1f5477735fd3f661792ba94600c84e971/public/"
+"""Before a round's number: where anyone can look up its randomness."""
+
 RERUN_STARTS = 20
 """Starts of every setting that are run anew for the level re-run."""
 
 RERUN_ALPHA = 0.01
-"""A re-run confirms a submission unless fresh starts went worse with a smaller p-value than this."""
+"""A re-run confirms a submission unless fresh starts went worse with a smaller p-value than this. So does training
+again on another kind of machine, where its seeds are compared."""
 
-CLAIMED, REPLAYED, RERUN = LEVELS = ("claimed", "replayed", "re-run")
+CLAIMED, REPLAYED, RERUN, RETRAINED = LEVELS = ("claimed", "replayed", "re-run", "retrained")
 """What is known of an entry: its author claims the outcomes; its actions have these outcomes; its checkpoints do as
-well on starts that nobody could know when it was submitted."""
+well on starts that nobody could know when it was submitted; its recipe, trained again, makes such policies."""
 
 STANDARD, CUSTOM = CLASSES = ("standard", "custom")
 """A submission with exactly the settings of its suite and training seeds of the protocol, and any other."""
@@ -155,20 +164,67 @@ def class_of(suite: str, settings: Mapping[str, BoardSetting], training_seeds: I
     return STANDARD if is_standard else CUSTOM
 
 
-def fresh_start(submission: str, value: str) -> int:
+@dataclass(frozen=True)
+class PublicValue:
+    """A random number that nobody could know before it was published: a round of drand's chain quicknet.
+
+    Args:
+        round: its number, which says when it was published.
+        randomness: 64 hexadecimal digits.
+    """
+
+    round: int
+    randomness: str
+
+    @classmethod
+    def of(cls, text: str) -> "PublicValue":
+        """The value of `ROUND:RANDOMNESS`.
+
+        Raises:
+            InputError: it is not one, or its round is still to come.
+        """
+        found = re.fullmatch(r"([1-9][0-9]{0,8}):([0-9a-f]{64})", text.strip().lower())
+        if not found:
+            raise InputError(
+                f"The public value must be a round of drand and its randomness, ROUND:64 hexadecimal digits, as "
+                f"{DRAND}latest says, not {text!a:.80}."
+            )
+        value = cls(int(found[1]), found[2])
+        if value.published > datetime.now(UTC):
+            raise InputError(f"Round {value.round} of drand is still to come.")
+        return value
+
+    def __str__(self) -> str:
+        return f"{self.round}:{self.randomness}"
+
+    @property
+    def published(self) -> datetime:
+        return datetime.fromtimestamp(DRAND_START + (self.round - 1) * DRAND_PERIOD, UTC)
+
+    @property
+    def address(self) -> str:
+        """Where anyone can look it up."""
+        return f"{DRAND}{self.round}"
+
+
+def fresh_start(submission: str, value: PublicValue) -> int:
     """The first start of a re-run: known to nobody before `value` is.
 
     Args:
         submission: hash of the submission.
-        value: a random number that was published after it, such as a round of drand or a pulse of NIST's beacon.
+        value: one that was published after it.
     """
-    drawn = int.from_bytes(sha256(f"{submission}/{value.strip().lower()}".encode()).digest())
+    drawn = int.from_bytes(sha256(f"{submission}/{value}".encode()).digest())
     return FIRST_FRESH + drawn % (2**30 - 10_000)
 
 
 def fresh_settings(settings: Mapping[str, BoardSetting], first_start: int) -> dict[str, BoardSetting]:
-    """The settings of a re-run: as those of a submission, from `RERUN_STARTS` fresh starts."""
+    """The settings of a re-run: as those of a submission, from `RERUN_STARTS` fresh starts.
+
+    Tasks with one initial state are left out: a fresh start of theirs is the one that is known.
+    """
     return {
         name: replace(one, episodes=min(one.episodes, RERUN_STARTS), first_start=first_start)
         for name, one in settings.items()
+        if one.task not in FIXED
     }

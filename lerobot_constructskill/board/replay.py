@@ -10,6 +10,7 @@ from typing import Any
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS
 from lerobot_constructskill.board.submission import Claim, Submission
+from lerobot_constructskill.board.verification import different
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER, Episode, deciding
 from lerobot_constructskill.errors import InputError
@@ -84,15 +85,11 @@ def jobs_of(claims: Iterable[Claim], together: int = TOGETHER) -> list[tuple[Cla
 def _reason(there: dict[str, str]) -> str:
     """A sentence about versions that differ, which may be the reason for a difference that is nobody's fault."""
     here = deciding()
-    others = [
-        f"{name} {there.get(name, 'unknown')[:40]!a} there, {here[name]} here"
-        for name in here
-        if there.get(name) != here[name]
-    ]
-    if not others:
-        return "It was made with the same versions and make of processor."
-    other_make = OTHER_MAKE if there.get("processor") != here["processor"] else ""
-    return f"It was made with others: {'; '.join(others)}.{other_make}"
+    if not (others := different(there, here)):
+        return "It was made with the same versions and revisions, and on the same make of processor."
+    other_make = OTHER_MAKE if "processor" in others else ""
+    told = "; ".join(f"{name} {was!a:.60} there, {now} here" for name, (was, now) in others.items())
+    return f"It was made with others: {told}.{other_make}"
 
 
 def open_workers(workers: int | None = None) -> AbstractContextManager[Submit]:

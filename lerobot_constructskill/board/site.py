@@ -2,6 +2,7 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -9,11 +10,13 @@ from markupsafe import Markup
 from lerobot_constructskill.analysis.report.formats import p_value, percent, share_range, whole
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
+from lerobot_constructskill.board.explained import drawn, meaning, picture
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.films import films_there, write_films
 from lerobot_constructskill.board.losses import by_seed, by_setting, checked, depends_on_seed
 from lerobot_constructskill.board.protocol import BOARD_SUITES, CLASSES, LEVELS, RANKED_FROM
 from lerobot_constructskill.board.recovered import MEANING, PATIENCE, STRIDES
+from lerobot_constructskill.board.rerun import describe
 from lerobot_constructskill.contract import STAGES
 from lerobot_constructskill.errors import InputError, plural
 
@@ -25,12 +28,15 @@ CELLS = (*STAGES, ERROR)
 """Kinds of outcome of an episode, each with a colour."""
 
 
-def write_board(root: Path, out: Path, dataset_id: str | None = None, films: bool = False) -> list[Path]:
+def write_board(
+    root: Path, out: Path, dataset_id: str | None = None, films: bool = False, documentation: str | None = None
+) -> list[Path]:
     """Write the pages of a board's folder, and the exports.
 
     Args:
         dataset_id: as of `exports.eval_results`, which are not written without it.
         films: make those that are missing; the pages name all that are there.
+        documentation: address of docs/leaderboard.md as a page, to which all pages lead back.
 
     Returns:
         The pages.
@@ -44,8 +50,9 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
     if films:
         write_films(entries, out)
     day = datetime.now(UTC).date().isoformat()
-    pages = {f"{suite}.html": _suite_page(suite, entries, out, day) for suite in BOARD_SUITES}
-    pages["index.html"] = _render("index.html", entries=entries, suites=BOARD_SUITES, day=day)
+    common = {"suites": BOARD_SUITES, "day": day, "documentation": documentation}
+    pages = {f"{suite}.html": _suite_page(suite, entries, out, common) for suite in BOARD_SUITES}
+    pages["index.html"] = _render("index.html", entries=entries, **common)
     for name, text in pages.items():
         write_text(out / name, text)
     write_exports(entries, out, day, dataset_id)
@@ -54,16 +61,16 @@ def write_board(root: Path, out: Path, dataset_id: str | None = None, films: boo
     return [out / name for name in pages]
 
 
-def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
+def _suite_page(name: str, entries: list[Entry], out: Path, common: dict[str, Any]) -> str:
     own = [entry for entry in entries if entry.declaration.suite == name]
     suite = BOARD_SUITES[name]
-    columns = list(dict.fromkeys([*suite.settings, *(one for entry in own for one in entry.declaration.settings)]))
+    settings = {column: one for entry in own for column, one in entry.declaration.settings.items()}
+    columns = suite.settings | {column: one for column, one in settings.items() if column not in suite.settings}
     ranked = {column: ranks(own, column) for column in columns}
     return _render(
         "suite.html",
         name=name,
         suite=suite,
-        suites=BOARD_SUITES,
         entries=sorted(own, key=lambda entry: _place(entry, ranked)),
         columns=columns,
         ranks=ranked,
@@ -77,7 +84,7 @@ def _suite_page(name: str, entries: list[Entry], out: Path, day: str) -> str:
         strides=STRIDES,
         films=lambda entry, column: films_there(entry, column, out),
         table=TABLE,
-        day=day,
+        **common,
     )
 
 
@@ -114,5 +121,6 @@ def _render(template: str, **context) -> str:
     )
     environment.filters |= {"percent": percent, "share_range": share_range, "plural": plural, "grid": grid}
     environment.filters |= {"by_setting": by_setting, "by_seed": by_seed, "checked": checked, "p_value": p_value}
-    environment.filters |= {"depends_on_seed": depends_on_seed, "number": whole}
+    environment.filters |= {"depends_on_seed": depends_on_seed, "number": whole, "rates": describe}
+    environment.filters |= {"meaning": meaning, "picture": picture, "drawn": drawn}
     return environment.get_template(template).render(**context)

@@ -2,12 +2,13 @@
 
 submission.yaml   `declaration.Declaration`: the policy, its settings, versions, and the hash of the other file
 episodes.parquet  `SCHEMA`
+recipe.yaml       where there is one: the study that made its policies (`recipe`)
 """
 
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +18,19 @@ import pyarrow as pa
 import yaml
 
 from lerobot_constructskill.artifacts.folders import staged
+from lerobot_constructskill.artifacts.revisions import PREFIX
 from lerobot_constructskill.artifacts.tables import Parquet
-from lerobot_constructskill.board.declaration import DECLARED, LINE, Declaration
+from lerobot_constructskill.board.copies import near_copy
+from lerobot_constructskill.board.declaration import DECLARED, LINE, Declaration, Trained
 from lerobot_constructskill.contract import STAGES, get_task
-from lerobot_constructskill.envs.actions import within_reach
-from lerobot_constructskill.envs.recording import ACTIONS, OUTCOME, Episode, to_rows, write_recordings
-from lerobot_constructskill.errors import InputError, MissingError, plural
+from lerobot_constructskill.envs.recording import ACTIONS, DECIDING, OUTCOME, Episode, to_rows, write_recordings
+from lerobot_constructskill.errors import DISTRIBUTION, InputError, MissingError, plural
 from lerobot_constructskill.files import bounded_memory, read_bytes, read_parquet, to_text
 from lerobot_constructskill.perturbations import Perturbation
 
-DECLARATION_FILE, EPISODES_FILE = "submission.yaml", "episodes.parquet"
+DECLARATION_FILE, EPISODES_FILE, RECIPE_FILE = "submission.yaml", "episodes.parquet", "recipe.yaml"
 
-MOST = {DECLARATION_FILE: 1 << 16, EPISODES_FILE: 64 << 20}
+MOST = {DECLARATION_FILE: 1 << 16, EPISODES_FILE: 64 << 20, RECIPE_FILE: 1 << 16}
 """Bytes that a file of a submission may have."""
 
 SLACK = 256 << 20
@@ -72,29 +74,41 @@ class Submission:
     Args:
         declaration: what its author says.
         claims: its episodes.
-        sha256: hash of submission.yaml, which names the hash of the episodes, so that it stands for all of it.
+        sha256: hash of submission.yaml, which names the hashes of the other files, so that it stands for all of it.
+        recipe: text of recipe.yaml; None without one. Nothing of it is looked at until the recipe is asked for.
     """
 
     declaration: Declaration
     claims: list[Claim]
     sha256: str
+    recipe: str | None = None
 
 
-def write_submission(root: Path, claims: Iterable[Claim], **declared: Any) -> Submission:
+def write_submission(
+    root: Path,
+    claims: Iterable[Claim],
+    recipe: str | None = None,
+    trained: Mapping[str, Any] | None = None,
+    **declared: Any,
+) -> Submission:
     """Write a submission's folder, whole or not at all, and read it again as anyone would.
 
     Args:
+        recipe: text of recipe.yaml.
+        trained: fields of `Trained` but for the hash, where there is a recipe.
         declared: fields of `Declaration` but for the hash.
 
     Raises:
         TakenError: the folder exists.
         InputError: it would be refused.
     """
-    unhashed = Declaration(**declared, episodes_sha256="0" * 64)  # refuses what is wrong before anything is written
+    made = recipe and Trained(_sha256(recipe.encode()), **trained or {})
+    unhashed = Declaration(**declared, episodes_sha256="0" * 64, trained=made)  # refused before anything is written
     with staged(root) as folder:
         write_recordings(claims, folder / EPISODES_FILE, SCHEMA)
-        hashed = hashlib.sha256((folder / EPISODES_FILE).read_bytes()).hexdigest()
-        plain = asdict(replace(unhashed, episodes_sha256=hashed))
+        if recipe is not None:
+            (folder / RECIPE_FILE).write_text(recipe, encoding="utf-8")
+        plain = asdict(replace(unhashed, episodes_sha256=_sha256((folder / EPISODES_FILE).read_bytes())))
         (folder / DECLARATION_FILE).write_text(
             yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, width=119), encoding="utf-8"
         )
@@ -110,13 +124,22 @@ def read_submission(root: Path) -> Submission:
     """
     content = _read_files(root)
     declaration = DECLARED.parse(to_text(content[DECLARATION_FILE], DECLARATION_FILE), DECLARATION_FILE)
-    if hashlib.sha256(content[EPISODES_FILE]).hexdigest() != declaration.episodes_sha256:
-        raise InputError(f"{EPISODES_FILE} is not the file that {DECLARATION_FILE} names: its hash differs.")
+    named = {EPISODES_FILE: declaration.episodes_sha256}
+    named |= {RECIPE_FILE: declaration.trained.recipe_sha256} if declaration.trained else {}
+    for name in sorted(content.keys() - {DECLARATION_FILE} | named.keys()):
+        if name not in content or _sha256(content[name]) != named.get(name):
+            raise InputError(f"{name} is not the file that {DECLARATION_FILE} names: its hash differs.")
+    _check_versions(declaration.versions)
     claims = _read_claims(root / EPISODES_FILE, declaration)
     for claim in claims:
         _check(claim)
     _check_copies(declaration, claims)
-    return Submission(declaration, claims, hashlib.sha256(content[DECLARATION_FILE]).hexdigest())
+    recipe = to_text(content[RECIPE_FILE], RECIPE_FILE) if RECIPE_FILE in content else None
+    return Submission(declaration, claims, _sha256(content[DECLARATION_FILE]), recipe)
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _read_files(root: Path) -> dict[str, bytes]:
@@ -124,11 +147,18 @@ def _read_files(root: Path) -> dict[str, bytes]:
     if root.is_symlink() or not root.is_dir():
         raise MissingError(f"'{root}' is not the folder of a submission.")
     found = os.listdir(root)
-    if absent := [name for name in MOST if name not in found]:
+    if absent := [name for name in (DECLARATION_FILE, EPISODES_FILE) if name not in found]:
         raise MissingError(f"'{root}' is not a submission: {absent[0]} is missing.")
     if others := sorted(set(found) - set(MOST)):
-        raise InputError(f"'{root}' holds {others[0]!a}; a submission is {' and '.join(MOST)}, and nothing else.")
-    return {name: read_bytes(root / name, most, links=False) for name, most in MOST.items()}
+        raise InputError(f"'{root}' holds {others[0]!a}; a submission is {', '.join(MOST)}, and nothing else.")
+    return {name: read_bytes(root / name, most, links=False) for name, most in MOST.items() if name in found}
+
+
+def _check_versions(versions: dict[str, str]) -> None:
+    """Refuse a submission that does not say which simulator and which of our code it was made with."""
+    said = {DISTRIBUTION if name.startswith(PREFIX) else name for name in versions}
+    if absent := [name for name in (DISTRIBUTION, *DECIDING) if name not in said]:
+        raise InputError(f"versions must say with which {absent[0]} it was made, as every recording does.")
 
 
 def _read_claims(path: Path, declaration: Declaration) -> list[Claim]:
@@ -207,17 +237,15 @@ def _rules_of_step(name: str, happened: bool, step: int | None, steps: int) -> l
 
 
 def _check_copies(declaration: Declaration, claims: list[Claim]) -> None:
-    """Refuse policies of two training seeds that place with the same actions to the last bit, as they are executed.
+    """Refuse policies of two training seeds that place with nearly the same actions, as they are executed.
 
-    So is one that places with the same actions though it was shown other pictures. A reference sees none.
+    So is one that places with nearly the same actions though it was shown other pictures. A reference sees none.
     """
-    if not declaration.about.is_policy:
-        return
-    first: dict[tuple, tuple[Claim, tuple]] = {}
-    for claim in claims:
-        if claim.placed:
-            acted = claim.training_seed, Perturbation(claim.perturb, claim.perturb_seed).pictures
-            executed = within_reach(claim.executed, get_task(claim.task, claim.action).action_names)
-            other, as_other = first.setdefault((claim.task, claim.evaluation_seed, executed.tobytes()), (claim, acted))
-            if acted != as_other:
-                raise InputError(f"{claim.label} has exactly the actions of {other.label}.")
+    if declaration.about.is_policy and (pair := near_copy(claims, claims, _is_one_policy)):
+        raise InputError(f"{pair[0].label} has the actions of {pair[1].label}, or nearly.")
+
+
+def _is_one_policy(one: Claim, other: Claim) -> bool:
+    """Whether two episodes from one start are of one policy that was shown the same."""
+    acted = [(claim.training_seed, Perturbation(claim.perturb, claim.perturb_seed).pictures) for claim in (one, other)]
+    return acted[0] == acted[1]

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_constructskill.bounds import Checked, RepoId
+from lerobot_constructskill.bounds import Checked, RepoId, Text
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.scripts.console import command
 
@@ -15,6 +15,7 @@ class BoardConfig(Checked):
     root: Path  # the board's folder, with entries/ and verified/
     out: Path = Path("outputs/board")  # folder to write
     films: bool = False  # also film an episode of each entry's setting that placed and one that did not
+    documentation: Text | None = None  # address of docs/leaderboard.md as a page, to which the pages lead back
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 
 
@@ -29,5 +30,5 @@ def board(config: BoardConfig) -> str:
     """
     from lerobot_constructskill.board.site import write_board
 
-    pages = write_board(config.root, config.out, config.dataset_id, config.films)
+    pages = write_board(config.root, config.out, config.dataset_id, config.films, config.documentation)
     return f"{plural(len(pages), 'page')} written; open {pages[-1]}"

@@ -16,7 +16,7 @@ class VerifyConfig:
     sample: Count | None = None  # number of episodes to replay, drawn at random; default: all
     workers: Workers | None = None  # processes; default: one per core
     record: Path | None = None  # folder to write the verdict to, for the board
-    value: Text | None = None  # public random number, newer than the submission: print how to make a re-run
+    value: Text | None = None  # ROUND:RANDOMNESS of drand, newer than the submission: print how to make a re-run
     rerun: Path | None = None  # a submission from those starts: verify it too, and compare the two
 
     def __post_init__(self):
@@ -40,25 +40,31 @@ def verify(config: VerifyConfig) -> str:
         InputError: it is not as it claims; the message says where.
         OSError: a worker died.
     """
-    from lerobot_constructskill.board.protocol import REPLAYED, RERUN
+    from lerobot_constructskill.board.entries import check_original
+    from lerobot_constructskill.board.protocol import REPLAYED, RERUN, PublicValue
     from lerobot_constructskill.board.replay import replay_submission
-    from lerobot_constructskill.board.rerun import compare_rerun, describe, instructions
+    from lerobot_constructskill.board.rerun import check_later, compare_rerun, describe, instructions
     from lerobot_constructskill.board.submission import read_submission
-    from lerobot_constructskill.board.verification import record_verification
+    from lerobot_constructskill.board.verification import read_verification, record_verification
 
     submission = read_submission(config.root)
-    if config.value is not None and config.rerun is None:
-        return instructions(submission, config.value)
-    level, facts, told = REPLAYED, None, ""
+    value = None if config.value is None else PublicValue.of(config.value)
+    if value and config.rerun is None:
+        return instructions(submission, value)
+    check_original(config.root)
+    verdict = config.record and config.record / f"{config.root.resolve().name}.json"
+    level, shown, told = REPLAYED, {}, ""
     if config.rerun is not None:  # compared before anything is replayed, which takes minutes
+        if verdict:
+            check_later(value, read_verification(verdict, submission.sha256).get("date"))
         again = read_submission(config.rerun)
-        rates = compare_rerun(submission, again, config.value)
+        rates = compare_rerun(submission, again, value)
         replay_submission(again, config.workers, config.sample)
-        level, facts = RERUN, {"value": config.value, "settings": {name: list(own) for name, own in rates.items()}}
+        level, shown["rerun"] = RERUN, {"value": str(value), "settings": rates}
         told = f" Placed, on its own starts and on fresh ones: {describe(rates)}."
     replayed = replay_submission(submission, config.workers, config.sample)
-    if config.record is not None:
-        record_verification(config.record / f"{config.root.resolve().name}.json", submission.sha256, level, facts)
+    if verdict:
+        record_verification(verdict, submission.sha256, level, **shown)
     failed = sum(claim.error is not None for claim in submission.claims)
     return (
         f"{config.root} holds: {len(replayed)} of {len(submission.claims)} episodes replayed "

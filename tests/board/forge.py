@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import yaml
 
-from lerobot_constructskill.board.submission import DECLARATION_FILE, EPISODES_FILE
+from lerobot_constructskill.board.submission import DECLARATION_FILE, EPISODES_FILE, RECIPE_FILE
 from lerobot_constructskill.perturbations import PICTURES
 
 type Forge = Callable[[Path, np.random.Generator], None]
@@ -368,6 +368,49 @@ def text_that_hides_text(root, rng):
 def an_address_that_is_a_script(root, rng):
     url = rng.choice(["javascript:alert(1)", "file:///etc/passwd", "http://x", 'https://x"onclick="y'])
     declare(root, lambda said: said["about"].update(url=str(url)))
+
+
+@forges(READ)
+def pictures_that_nobody_rendered(root, rng):
+    declare(root, lambda said: said.update(backend="physx_cpu, none rendering"))
+
+
+@forges(READ)
+def no_version_of_what_it_was_made_with(root, rng):
+    name = rng.choice(["sapien", "mani_skill", "numpy", "torch", "lerobot_env_constructskill"])
+    declare(root, lambda said: said["versions"].pop(name))
+
+
+@forges(READ)
+def starts_of_demonstrations(root, rng):
+    first = int(rng.choice([999_999, 1_000_000, 2**30 - 1]))
+
+    def change(said):
+        for setting in said["settings"].values():
+            setting["first_start"] = first
+
+    declare(root, change)
+    edit(root, lambda rows: [row.update(evaluation_seed=first + row["evaluation_seed"] - 5000) for row in rows])
+
+
+@forges(READ)
+def a_recipe_that_is_not_declared(root, rng):
+    (root / RECIPE_FILE).write_text(rng.choice(["", "name: mine\n", "!!python/name:os.system"]))
+
+
+@forges(READ)
+def a_declared_recipe_that_is_not_there(root, rng):
+    weights = {"brick_to_bin_shifted": [None, "0" * 64], "block_to_bin": [None, None]}
+    trained = {"recipe_sha256": "0" * 64, "weights": weights, "made_with": {}}
+    declare(root, lambda said: said.update(trained=trained))
+
+
+@forges(READ)
+def weights_of_too_few_seeds(root, rng):
+    weights = {"brick_to_bin_shifted": ["0" * 64], "block_to_bin": [None, None]}
+    trained = {"recipe_sha256": hashlib.sha256(b"").hexdigest(), "weights": weights, "made_with": {}}
+    declare(root, lambda said: said.update(trained=trained))
+    (root / RECIPE_FILE).touch()
 
 
 # Refused when replayed

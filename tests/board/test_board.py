@@ -14,9 +14,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
+from markupsafe import escape
 
 from lerobot_constructskill.board import films, verification
 from lerobot_constructskill.board.entries import ranks, read_entries
+from lerobot_constructskill.board.explained import meaning
 from lerobot_constructskill.board.exports import eval_info, write_exports
 from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, BoardSetting
 from lerobot_constructskill.board.site import write_board
@@ -44,22 +46,20 @@ class Page(HTMLParser):
 def many(valid, tmp_path_factory):
     """A board: a policy that places with eight of ten training seeds, one that never does, and one of two seeds."""
     root = tmp_path_factory.mktemp("many")
-    submission = read_submission(valid)
-    said, (good, bad) = (
-        submission.declaration,
-        (
-            [one for one in submission.claims if one.training_seed == seed and one.setting == "block_to_bin"]
-            for seed in (0, 1)
-        ),
+    said = read_submission(valid).declaration
+    placed, never = (
+        [one for one in read_submission(BOARD / "entries" / name).claims if one.setting == "block_to_bin"]
+        for name in ("bins_keypoints", "bins_random")
     )
-    settings = {"block_to_bin": BoardSetting("block_to_bin", episodes=2)}
-    for name, seeds, placing in (("good", 10, 8), ("bad", 10, 0), ("few", 2, 2)):
-        claims = []
-        for seed in range(seeds):
-            for one in good if seed < placing else bad:
-                actions = one.flat.copy()
-                actions[0] += seed * 1e-4
-                claims.append(Claim(**vars(one) | {"training_seed": seed, "actions": [actions]}))
+    for name, seeds, placing, first in (("good", 10, 8, 5006), ("bad", 10, 0, 5006), ("few", 2, 2, 5010)):
+        settings = {"block_to_bin": BoardSetting("block_to_bin", episodes=2, first_start=first)}
+        claims = [
+            Claim(**vars(one) | {"training_seed": seed})
+            for seed in range(seeds)
+            for one in (placed if seed < placing else never)
+            if one.evaluation_seed in settings["block_to_bin"].starts
+            and (seed >= placing or one.training_seed == seed)
+        ]
         if name == "bad":
             claims[0] = Claim(claims[0].evaluation_seed, setting="block_to_bin", error="<b>out of memory</b>")
         about = replace(said.about, name=f"<script>{name}</script>", observes="pixels")
@@ -71,8 +71,14 @@ def many(valid, tmp_path_factory):
 
 
 def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
-    pages = {path.stem: Page(path.read_text()) for path in write_board(BOARD, tmp_path, "alice/bench")}
+    texts = {path.stem: path.read_text() for path in write_board(BOARD, tmp_path, "alice/bench")}
+    pages = {name: Page(text) for name, text in texts.items()}
     entries, _ = read_entries(BOARD)
+    for name, suite in BOARD_SUITES.items():
+        shown = [one for entry in entries if entry.declaration.suite == name for one in entry.standings]
+        assert texts[name].count('class="interval"') == len(shown)
+        assert all(str(escape(meaning(one))) in texts[name] for one in suite.settings.values())
+        assert len(pages[name].found["src"]) >= len({one.task for one in suite.settings.values()})
     others = json.loads((tmp_path / "exports" / "leaderboard.json").read_text())
     assert entries and pages.keys() == {"index", *BOARD_SUITES}
     for entry in entries:
@@ -87,10 +93,23 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
         assert official == any(one["model"] == entry.name for one in others["results"])
     for page in pages.values():
         links = {link for link in page.found["href"] if not link.startswith(("#", "data:"))}
-        assert not page.found["src"] and all((tmp_path / link).is_file() for link in links)
+        assert all(source.startswith("data:image/jpeg;base64,") for source in page.found["src"])
+        assert all((tmp_path / link).is_file() for link in links)
         assert {link[1:] for link in page.found["href"] if link.startswith("#")} <= page.found["id"]
     table = pq.read_table(tmp_path / "board.parquet")
     assert table.num_rows == sum(len(entry.submission.claims) for entry in entries)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("width", [390, 1280])
+def test_only_tables_scroll_sideways_and_all_pages_lead_back(width, tmp_path, browser):
+    page = browser.new_page(viewport={"width": width, "height": 844})
+    for path in write_board(BOARD, tmp_path, documentation="../docs/leaderboard.html"):
+        page.goto(path.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
+        assert page.locator('a[href="../docs/leaderboard.html"]').is_visible()
+        assert page.evaluate("[...document.images].every(image => image.naturalWidth > 0)")
+    page.close()
 
 
 def test_ranks_are_of_seeds_and_ties_are_ties(many):
@@ -187,6 +206,15 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
         assert read_entries(root)[0][0].level == level
+    value = {"value": f"1:{'ab' * 32}", "settings": {"block_to_bin": [0.8, 0.8]}}
+    for wrong, why in (
+        ({}, "does not show its rates"),
+        ({"rerun": {"value": "abc", "settings": {}}}, "must be a round of drand"),
+        ({"rerun": {"settings": {}}}, "rerun.value: it is missing"),
+        ({"rerun": value}, "needs a value of a later day"),
+    ):
+        path.write_text(json.dumps(verdict | {"level": "re-run"} | wrong))
+        assert why in read_entries(root)[1][0]
     path.write_text('{"level": "best"}')
     assert "is not a verdict of constructskill-verify: submission: it is missing" in read_entries(root)[1][0]
     path.unlink()
@@ -220,12 +248,14 @@ def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
     path, versions = tmp_path / "entry.json", {"sapien": "3"}
     replayed = {"submission": "0" * 64, "level": "replayed", "versions": versions}
     since = {"date": datetime.now(UTC).date().isoformat()}
-    rerun = replayed | {"level": "re-run", "rerun": {"value": "beef"}}
+    rerun = replayed | {"level": "re-run", "rerun": {"value": "1:ab", "settings": {"one": [0.5, 0.4]}}}
+    trained = {"level": "retrained", "retrained": {"exact": True, "settings": {"one": [0.5, 0.5]}}}
 
     def recorded(machine, facts):
         monkeypatch.setattr(verification, "processor", lambda: machine)
         monkeypatch.setattr(verification, "deciding", lambda: facts["versions"] | {"processor": "a make"})
-        verification.record_verification(path, facts["submission"], facts["level"], facts.get("rerun"))
+        shown = {name: facts[name] for name in ("rerun", "retrained") if name in facts}
+        verification.record_verification(path, facts["submission"], facts["level"], **shown)
         return json.loads(path.read_text())
 
     assert recorded("A", replayed) == since | replayed | {"machines": ["A"]}
@@ -235,6 +265,8 @@ def test_a_verdict_keeps_what_else_is_known(tmp_path, monkeypatch):
     assert recorded("C", replayed) == since | rerun | {"machines": ["A", "B", "C"]}, "a replay does not undo a re-run"
     newer = {"versions": {"sapien": "4"}}
     assert recorded("D", replayed | newer) == since | rerun | newer | {"machines": ["D"]}
+    assert recorded("D", replayed | newer | trained) == since | rerun | newer | trained | {"machines": ["D"]}
+    assert recorded("D", rerun | newer)["level"] == "retrained", "a re-run does not undo a training"
     other = replayed | {"submission": "1" * 64}
     assert recorded("E", other) == other | {"date": datetime.now(UTC).date().isoformat(), "machines": ["E"]}
 

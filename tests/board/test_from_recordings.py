@@ -1,5 +1,6 @@
 """From recordings to a submission: what is missing or was recorded twice is refused, what failed stays counted."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,10 @@ import yaml
 
 from lerobot_constructskill.board.declaration import DRAWS, About
 from lerobot_constructskill.board.from_recordings import recorded_by_study, recorded_in, submit, with_draws
-from lerobot_constructskill.board.protocol import BoardSetting
+from lerobot_constructskill.board.protocol import BoardSetting, PublicValue
 from lerobot_constructskill.board.rerun import instructions
 from lerobot_constructskill.board.submission import read_submission
-from lerobot_constructskill.envs.recording import COUNTS, RECORDINGS, Episode, write_recordings
+from lerobot_constructskill.envs.recording import COUNTS, RECORDINGS, Episode, deciding, write_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.submit import SubmitConfig
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_rows
@@ -21,11 +22,18 @@ from lerobot_constructskill.study.rows import NOT_RUN, ROWS, STUDY, Row, write_r
 CONTROL = BoardSetting("block_to_bin", episodes=2, episode_length=2, first_start=7)
 SETTINGS = {"control": CONTROL, "block": replace(CONTROL, perturb="pose=1")}
 NOTHING_YET = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys((*COUNTS, "cost"), 0)
+BACKEND, VERSIONS = "physx_cpu, sapien_cpu rendering", json.dumps(deciding())
 ABOUT = About(*["a test's"] * 7, observes="pixels")
 
 
 def recording(start, value=0.01, **facts):
-    made = {"task": "block_to_bin", "episode_length": 2, "perturb": " pose=1", "backend": "physx_cpu, none rendering"}
+    made = {
+        "task": "block_to_bin",
+        "episode_length": 2,
+        "perturb": " pose=1",
+        "backend": BACKEND,
+        "versions": VERSIONS,
+    }
     one = Episode(start, **made | facts)
     for _ in range(2):
         one.add(np.full(4, value), NOTHING_YET)
@@ -52,7 +60,7 @@ def test_what_was_recorded_becomes_a_submission(recorded, tmp_path):
         (name, seed, start) for seed in (0, 3) for name in SETTINGS for start in (7, 8)
     ]
     assert submission.declaration.settings_class == "custom" and submission.declaration.training_seeds == [0, 3]
-    assert submission.declaration.backend == "physx_cpu, none rendering"
+    assert submission.declaration.backend == BACKEND
 
 
 def test_a_policy_may_act_in_the_full_action_and_is_run_again_in_it(tmp_path):
@@ -64,7 +72,7 @@ def test_a_policy_may_act_in_the_full_action_and_is_run_again_in_it(tmp_path):
             one.write(tmp_path / "recorded" / "seed_0")
     submission = made(tmp_path / "made", recorded_in(tmp_path / "recorded"))
     assert [claim.environment["action"] for claim in read_submission(tmp_path / "made").claims] == ["full"] * 4
-    assert instructions(submission, "1").count("--env.action=full") == 2
+    assert instructions(submission, PublicValue(1, "0" * 64)).count("--env.action=full") == 2
 
 
 @pytest.mark.parametrize(
@@ -126,7 +134,7 @@ def test_what_does_not_belong_together_is_refused(recorded, tmp_path):
 def test_what_is_not_in_a_submission_may_have_been_recorded_elsewhere(recorded, tmp_path):
     recording(9, 0.02, backend="physx_cuda, gpu rendering").write(recorded / "seed_0" / "fresh")
     recording(7, task="brick_to_bin", versions="{}").write(recorded / "seed_0")
-    assert made(tmp_path / "made", recorded_in(recorded)).declaration.backend == "physx_cpu, none rendering"
+    assert made(tmp_path / "made", recorded_in(recorded)).declaration.backend == BACKEND
 
 
 FACTS = {

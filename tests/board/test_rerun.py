@@ -8,12 +8,12 @@ import pytest
 import yaml
 
 from lerobot_constructskill.board.declaration import MOST_SETTINGS
-from lerobot_constructskill.board.protocol import BoardSetting, fresh_settings, fresh_start
-from lerobot_constructskill.board.rerun import compare_rerun, instructions
+from lerobot_constructskill.board.protocol import BoardSetting, PublicValue, fresh_settings, fresh_start
+from lerobot_constructskill.board.rerun import check_later, compare_rerun, instructions
 from lerobot_constructskill.board.submission import Claim, Submission, read_submission
 from lerobot_constructskill.errors import InputError
 
-STARTS, VALUE = 50, "beef"
+STARTS, VALUE = 50, PublicValue(1, "ab" * 32)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def worse(submission: Submission, again: Submission) -> set[str]:
     try:
         compare_rerun(submission, again, VALUE)
     except InputError as error:
-        told = str(error).removeprefix("The re-run does not confirm it: ")
+        told = str(error).removeprefix("The second time does not confirm it: ")
         return set(re.findall(r"(\S+) \d+% submitted, \d+% run anew \(p = ", told))
     return set()
 
@@ -93,22 +93,39 @@ def test_starts_that_could_refuse_nothing_confirm_nothing(submission, starts, en
             compare_rerun(few, rerun(few, 1.0), VALUE)
 
 
-def test_one_start_is_compared_by_training_seeds(submission):
-    """As `brick_to_bin` has one: all its ten seeds placed, and none does when it is run anew."""
-    said = replace(
-        submission.declaration, settings={"fixed": BoardSetting("brick_to_bin", 1)}, training_seeds=[*range(10)]
-    )
+def test_a_task_with_one_initial_state_is_no_part_of_a_rerun(submission):
+    """Its fresh starts are the start that is known."""
+    settings = {"fixed": BoardSetting("brick_to_bin", 1), **submission.declaration.settings}
+    declaration = replace(submission.declaration, settings=settings)
+    more = replace(submission, declaration=declaration, claims=claims(settings, 1.0))
+    assert "fixed" not in instructions(more, VALUE) and "fixed" not in compare_rerun(more, rerun(more, 1.0), VALUE)
+    alone = replace(declaration, settings={"fixed": settings["fixed"]})
+    with pytest.raises(InputError, match="one initial state each"):
+        instructions(replace(submission, declaration=alone), VALUE)
 
-    def placing(declaration, seeds):
-        (start,) = declaration.settings["fixed"].starts
-        runs = [Claim(start, placed=seed < seeds, setting="fixed", training_seed=seed) for seed in range(10)]
-        return replace(submission, declaration=declaration, claims=runs)
 
-    own = placing(said, 10)
-    fresh = replace(said, settings=fresh_settings(said.settings, fresh_start(own.sha256, VALUE)))
-    compare_rerun(own, placing(fresh, 9), VALUE)
-    with pytest.raises(InputError, match="100% submitted, 0% run anew"):
-        compare_rerun(own, placing(fresh, 0), VALUE)
+def test_a_rerun_is_of_the_policy_that_was_submitted(submission):
+    again = rerun(submission, 1.0)
+    about = replace(again.declaration.about, revision="another commit")
+    with pytest.raises(InputError, match="may be of another policy"):
+        compare_rerun(submission, replace(again, declaration=replace(again.declaration, about=about)), VALUE)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"), [("abc", "must be a round of drand"), (f"999999999:{'ab' * 32}", "is still to come")]
+)
+def test_what_is_no_public_value_is_refused(value, said):
+    with pytest.raises(InputError, match=said):
+        PublicValue.of(value)
+
+
+def test_a_value_is_of_a_later_day_than_the_first_verdict():
+    value = PublicValue.of(f" 20000000:{'AB' * 32}")
+    assert str(value) == f"20000000:{'ab' * 32}" and value.published.date().isoformat() == "2025-07-18"
+    check_later(value, "2025-07-17")
+    for known in ("2025-07-18", "2026-01-01", None):
+        with pytest.raises(InputError, match="a value of a later day"):
+            check_later(value, known)
 
 
 def test_many_settings_hide_nothing(submission):
