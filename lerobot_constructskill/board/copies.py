@@ -22,12 +22,12 @@ SHARE = 0.5
 """Two episodes are nearly the same if this share of the longer one's steps are, counted from the start or the end."""
 
 
-def near_copy[Claim: Episode](
-    claims: Iterable[Claim],
-    others: Iterable[Claim],
-    may_be: Callable[[Claim, Claim], bool],
+def near_copy[Kind: Episode](
+    claims: Iterable[Kind],
+    others: Iterable[Kind],
+    may_be: Callable[[Kind, Kind], bool],
     tolerance: float = TOLERANCE,
-) -> tuple[Claim, Claim] | None:
+) -> tuple[Kind, Kind] | None:
     """A placing episode of `claims` that is nearly one of `others`, and that one; None where there is none.
 
     Args:
@@ -40,7 +40,7 @@ def near_copy[Claim: Episode](
     return None
 
 
-def _by_start[Claim: Episode](claims: Iterable[Claim]) -> dict[tuple[str, int], list[Claim]]:
+def _by_start[Kind: Episode](claims: Iterable[Kind]) -> dict[tuple[str, int], list[Kind]]:
     placed = sorted((one for one in claims if one.placed), key=_where)
     return {where: list(own) for where, own in groupby(placed, key=_where)}
 
@@ -49,9 +49,9 @@ def _where(claim: Episode) -> tuple[str, int]:
     return claim.task, claim.evaluation_seed
 
 
-def _first_near[Claim: Episode](
-    own: list[Claim], others: list[Claim], may_be: Callable[[Claim, Claim], bool], tolerance: float
-) -> tuple[Claim, Claim] | None:
+def _first_near[Kind: Episode](
+    own: list[Kind], others: list[Kind], may_be: Callable[[Kind, Kind], bool], tolerance: float
+) -> tuple[Kind, Kind] | None:
     longest = max(one.steps for one in (*own, *others))
     there = _stacked(others, longest)
     for claim, *here in zip(own, *_stacked(own, longest), strict=True):

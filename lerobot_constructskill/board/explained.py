@@ -10,7 +10,7 @@ from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.perturbations import AXES, Perturbation
 
-PICTURES = Path(__file__).parents[2] / "examples" / "pictures"
+TASK_PICTURES = Path(__file__).parents[2] / "examples" / "pictures"
 """Pictures of the tasks, by their names; beside the package in a checkout, and nowhere else."""
 
 MEANINGS = {
@@ -41,7 +41,7 @@ def meaning(setting: BoardSetting) -> str:
 
 def picture(task: str) -> Markup | None:
     """A task's picture as an element that holds it; None where there is none."""
-    file = PICTURES / f"{task}.jpg"
+    file = TASK_PICTURES / f"{task}.jpg"
     if not file.is_file():
         return None
     data = b64encode(file.read_bytes()).decode()

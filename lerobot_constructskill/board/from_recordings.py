@@ -5,9 +5,11 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from lerobot_constructskill.board.declaration import OBSERVES, About
 from lerobot_constructskill.board.protocol import BoardSetting, environment_key
+from lerobot_constructskill.board.recipe import recipe_of, trained_by
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
@@ -79,6 +81,26 @@ def recorded_by_study(
     return recorded, failures
 
 
+def trained_by_study(
+    root: Path, variant: str, settings: Mapping[str, BoardSetting], chosen: Sequence[str] | None = None
+) -> tuple[str, dict[str, Any]]:
+    """The recipe of a study's variant, and what the study made by it: fields of `Trained` without the recipe's hash.
+
+    Raises:
+        InputError: the recipe names a file, or a setting's policies are not the study's.
+    """
+    rows = read_rows(root / ROWS)
+    own = rows[rows["variant"] == variant]
+    places = _places(root)
+    theirs = _alike(root, own["setting"].unique(), settings, chosen)
+    named = {environment_key(**setting.environment): name for name, setting in settings.items()}
+    called = {named[places[one]]: one for one in theirs}
+    if absent := [name for name in settings if name not in called]:
+        raise InputError(f"the study has no setting that evaluates as {absent[0]}")
+    own = own[own["setting"].isin(theirs)]
+    return recipe_of(root, variant, called), trained_by(own, called, sorted(map(int, own["training_seed"].unique())))
+
+
 def with_draws(about: About, study: Path) -> About:
     """What is said of a policy, with what its study's folder says of its demonstrations.
 
@@ -95,12 +117,7 @@ def _alike(
     root: Path, ran: Iterable[str], settings: Mapping[str, BoardSetting], chosen: Sequence[str] | None
 ) -> list[str]:
     """Those settings of a study that a variant `ran` in and that evaluate as one of `settings` does."""
-    places = {
-        name: environment_key(
-            env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0)
-        )
-        for name, env in read_environments(root).items()
-    }
+    places = _places(root)
     if unknown := [name for name in chosen or () if name not in places]:
         raise InputError(f"The study has no setting '{unknown[0]}'; it has: {', '.join(places)}.")
     asked = [environment_key(**setting.environment) for setting in settings.values()]
@@ -117,6 +134,16 @@ def _alike(
     return list(alike)
 
 
+def _places(root: Path) -> dict[str, tuple[str, int, str]]:
+    """Where each setting of a study is evaluated, as `environment_key` has it."""
+    return {
+        name: environment_key(
+            env["task"], env.get("episode_length"), env.get("perturb", ""), env.get("perturb_seed", 0)
+        )
+        for name, env in read_environments(root).items()
+    }
+
+
 def _told(places: Iterable[tuple[str, int, str]]) -> str:
     return ", ".join(f"{task}{label} ({length} steps)" for task, length, label in dict.fromkeys(places))
 
@@ -128,11 +155,13 @@ def submit(
     settings: Mapping[str, BoardSetting],
     recorded: Recorded,
     failures: Failures,
+    made: tuple[str, Mapping[str, Any]] | None = None,
 ) -> Submission:
     """Write a submission of what was recorded.
 
     Args:
         failures: training seeds whose missing episodes failed, and why; they stay in the denominator.
+        made: the recipe and what it made, as `trained_by_study` returns them.
 
     Raises:
         TakenError: `root` exists.
@@ -156,9 +185,12 @@ def submit(
         raise InputError(
             f"about.observes is {about.observes}, but the policy was shown {min(shown)}: it can observe no more."
         )
+    recipe, trained = made or (None, None)
     return write_submission(
         root,
         claims,
+        recipe,
+        trained,
         about=about,
         suite=suite,
         settings=dict(settings),

@@ -102,7 +102,7 @@ def write_submission(
         TakenError: the folder exists.
         InputError: it would be refused.
     """
-    made = recipe and Trained(_sha256(recipe.encode()), **trained or {})
+    made = None if recipe is None else Trained(_sha256(recipe.encode()), **trained or {})
     unhashed = Declaration(**declared, episodes_sha256="0" * 64, trained=made)  # refused before anything is written
     with staged(root) as folder:
         write_recordings(claims, folder / EPISODES_FILE, SCHEMA)

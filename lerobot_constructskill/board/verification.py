@@ -15,7 +15,7 @@ from lerobot_constructskill.envs.recording import deciding
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Json
 
-SHOWN = {RERUN: "rerun", RETRAINED: "retrained"}
+RATES_OF = {RERUN: "rerun", RETRAINED: "retrained"}
 """The field of a verdict that shows a level's rates."""
 
 
@@ -61,7 +61,7 @@ def read_verification(path: Path, submission: str) -> dict[str, Any]:
     if not os.path.lexists(path):
         return {}
     found = {"machines": []} | VERIFICATION.read(path)
-    if (shown := SHOWN.get(found["level"])) and shown not in found:
+    if (shown := RATES_OF.get(found["level"])) and shown not in found:
         raise InputError(f"'{path}' says {found['level']}, and does not show its rates: record it anew.")
     return found if found["submission"] == submission else {}
 
@@ -72,7 +72,7 @@ def record_verification(path: Path, submission: str, level: str, **shown: Any) -
     What else is known of the submission stays: the first date, other machines, a higher level and its rates.
 
     Args:
-        shown: the fields named in `SHOWN`, those that were found.
+        shown: the fields named in `RATES_OF`, those that were found.
     """
     versions = {name: value for name, value in deciding().items() if name != "processor"}  # the make is no version
     facts = {"submission": submission, "level": level, "versions": versions}
@@ -80,7 +80,7 @@ def record_verification(path: Path, submission: str, level: str, **shown: Any) -
     with locked(lock):  # of two at once the second adds to what the first has written
         before = read_verification(path, submission)
         facts["level"] = max(level, before.get("level", CLAIMED), key=LEVELS.index)
-        facts |= {name: before[name] for name in SHOWN.values() if name in before} | shown
+        facts |= {name: before[name] for name in RATES_OF.values() if name in before} | shown
         earlier = before["machines"] if before.get("versions") == versions else []
         first = {"date": before.get("date", datetime.now(UTC).date().isoformat())}
         facts = first | facts | {"machines": list(dict.fromkeys([*earlier, processor()]))}

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from lerobot_constructskill.board.protocol import BOARD_SUITES
+from lerobot_constructskill.board.protocol import BOARD_SUITES, BoardSetting
 from lerobot_constructskill.bounds import Among, Text, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import command
@@ -66,10 +66,24 @@ def submit(config: SubmitConfig) -> str:
         )
         failures = said | failures
         about = from_recordings.with_draws(about, config.study)
-    made = from_recordings.submit(config.root, about, config.suite, settings, recorded, failures)
+    recipe, told = _recipe(config, settings)
+    made = from_recordings.submit(config.root, about, config.suite, settings, recorded, failures, recipe)
     size = (config.root / EPISODES_FILE).stat().st_size
     return (
         f"{config.root}: {made.declaration.settings_class}, {plural(len(made.claims), 'episode')} of "
         f"{plural(len(made.declaration.training_seeds), 'training seed')}, "
-        f"{size / 1e6:.2f} MB; now constructskill-verify."
+        f"{size / 1e6:.2f} MB; {told}; now constructskill-verify."
     )
+
+
+def _recipe(config: SubmitConfig, settings: dict[str, BoardSetting]) -> tuple[tuple[str, dict] | None, str]:
+    """The recipe of a submission with what it made, or None, and what is said of that."""
+    from lerobot_constructskill.board.from_recordings import trained_by_study
+
+    if config.study is None or config.variant is None:
+        return None, "no recipe, as recordings have none"
+    try:
+        made = trained_by_study(config.study, config.variant, settings, config.study_settings)
+    except InputError as error:
+        return None, f"no recipe, so nobody can train it again ({str(error).rstrip('.')})"
+    return made, "with its recipe"
