@@ -205,7 +205,15 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
     }
     for said, level in ((verdict, "replayed"), (verdict | {"submission": "0" * 64}, "claimed")):
         path.write_text(json.dumps(said))
-        assert read_entries(root)[0][0].level == level
+        found = read_entries(root)[0][0]
+        assert found.level == level
+        assert found.other_versions == (["sapien 3.0.3, verified with 3"] if level == "replayed" else [])
+    rates = {"settings": {"block_to_bin": [0.8, 0.7]}}
+    for exact, told in ((True, "the same to the last bit"), (False, "compared by seeds")):
+        path.write_text(json.dumps(verdict | {"level": "retrained", "retrained": rates | {"exact": exact}}))
+        write_board(root, tmp_path / "site")
+        text = (tmp_path / "site" / "bins.html").read_text()
+        assert f"{told}: block_to_bin 80% submitted, 70% again" in text and "other versions" in text
     value = {"value": f"1:{'ab' * 32}", "settings": {"block_to_bin": [0.8, 0.8]}}
     for wrong, why in (
         ({}, "does not show its rates"),
