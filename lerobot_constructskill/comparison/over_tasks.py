@@ -1,6 +1,5 @@
 """Compares two variants over several tasks: in each, and by the mean over tasks of every training seed."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,17 +52,16 @@ def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alp
     names = [name for name in settings_of(a) if name in settings_of(b)]
     if not names:
         raise InputError(f"'{a.name}' and '{b.name}' ran in no setting together.")
-    tasks = {name: match(*_in(name, a, b), asked, evaluate, alpha) for name in names}
+    tasks = {name: match(_in(name, a), _in(name, b), asked, evaluate, alpha) for name in names}
     rates_a, rates_b = (np.mean(rates, axis=0) for rates in (_rates(tasks, "a"), _rates(tasks, "b")))
     one = next(iter(tasks.values()))
     return OverTasks(tasks, [*rates_a], [*rates_b], judge(one.a.units(rates_a), one.b.units(rates_b), alpha))
 
 
-def _in(setting: str, *sources: Source) -> Iterator[Source]:
-    """The sources in one setting."""
-    for source in sources:
-        arm = setting + source.arm.removeprefix(EVERY[:-1])
-        yield replace(source, arm=arm, name=f"{source.folders[0]}:{arm}")
+def _in(setting: str, source: Source) -> Source:
+    """The source in one setting."""
+    arm = setting + source.arm.removeprefix(EVERY[:-1])
+    return replace(source, arm=arm, name=f"{source.folders[0]}:{arm}")
 
 
 def _rates(tasks: dict[str, MatchedSides], letter: str) -> list[list[float]]:

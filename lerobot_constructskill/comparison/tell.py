@@ -21,8 +21,10 @@ CONCLUSIONS = {
 }
 
 
-def tell(matched: MatchedSides, alpha: float) -> str:
+def tell(matched: MatchedSides | OverTasks, alpha: float) -> str:
     """The whole output, one paragraph for each question of a reader."""
+    if isinstance(matched, OverTasks):
+        return _over_tasks(matched, alpha)
     judgement = matched.judgement
     paragraphs = (
         _sides(matched),
@@ -34,7 +36,7 @@ def tell(matched: MatchedSides, alpha: float) -> str:
     return "\n\n".join(filter(None, paragraphs))
 
 
-def tell_over_tasks(over: OverTasks, alpha: float) -> str:
+def _over_tasks(over: OverTasks, alpha: float) -> str:
     """The output for several tasks: each in a line, then the mean over tasks of every seed."""
     one = next(iter(over.tasks.values()))
     lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", "", f"{'':24}{'A, mean of seeds':<18}B, mean of seeds"]

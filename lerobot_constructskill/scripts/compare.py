@@ -84,7 +84,7 @@ def compare(config: CompareConfig) -> str:
     from lerobot_constructskill.comparison.match import Asked, match
     from lerobot_constructskill.comparison.over_tasks import is_over_tasks, match_over_tasks
     from lerobot_constructskill.comparison.sides import find
-    from lerobot_constructskill.comparison.tell import as_json, tell, tell_over_tasks
+    from lerobot_constructskill.comparison.tell import as_json, tell
 
     a, b = find(config.a), find(config.b)
     with staged(config.out) if config.out else nullcontext() as folder:
@@ -96,12 +96,12 @@ def compare(config: CompareConfig) -> str:
             return evaluate(source, env, starts, config.together, config.device, kept_in)
 
         asked = Asked(config.env, config.seed, config.episodes)
-        over_tasks = is_over_tasks(a, b)
-        matched = (match_over_tasks if over_tasks else match)(a, b, asked, evaluated, config.alpha)
+        compared = a, b, asked, evaluated, config.alpha
+        matched = match_over_tasks(*compared) if is_over_tasks(a, b) else match(*compared)
         if folder:
             folder.mkdir(exist_ok=True)
             (folder / "comparison.json").write_text(as_json(matched), encoding="utf-8")
-    told = (tell_over_tasks if over_tasks else tell)(matched, config.alpha)
+    told = tell(matched, config.alpha)
     if config.fail_if == matched.judgement.conclusion:
         say(told)
         raise SystemExit(FAILED)
