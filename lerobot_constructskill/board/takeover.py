@@ -5,9 +5,12 @@ episode may end in another step. A forked process keeps all, in milliseconds.
 """
 
 import warnings
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import get_context
+
+import numpy as np
 
 from lerobot_constructskill.artifacts.pools import DIED, be_killed_with_parent
 from lerobot_constructskill.board.recovered import PATIENCE, STRIDES
@@ -18,6 +21,9 @@ from lerobot_constructskill.demos.expert import Expert, ExpertConfig, make_exper
 from lerobot_constructskill.demos.state import PrivilegedState
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import MachineError
+
+STILL = 0.0005
+"""Metres that hand, fingers and object move at least in `PATIENCE` steps, unless the expert is stuck."""
 
 EVERY = 10
 """Steps between two attempts in an episode that is drawn to check the search."""
@@ -73,13 +79,21 @@ class Walk:
         self.at = step
 
     def take_over(self) -> Attempt:
-        """Have the expert act from here on, for as many steps as an episode has, until it places or gives up."""
+        """Have the expert act from here on, for as many steps as an episode has, until it places or gives up.
+
+        It gives up where its advice is hopeless, or nothing moves, for `PATIENCE` steps: advice is a function of the
+        state, so that it would stay the same.
+        """
+        places: deque[np.ndarray] = deque(maxlen=PATIENCE)
         hopeless = 0
         for step in range(1, min(self.claim.episode_length, get_task(self.claim.task).horizon) + 1):
-            advice = self.expert.advise(self.state)
+            state = self.state
+            advice = self.expert.advise(state)
             hopeless = hopeless + 1 if advice.hopeless else 0
-            if hopeless == PATIENCE:
+            place = np.concatenate([state.tcp, state.object_pose[:3], state.fingers])
+            if hopeless == PATIENCE or len(places) == PATIENCE and abs(place - places[0]).max() < STILL:
                 break
+            places.append(place)
             _, _, is_placed, _, _ = self.env.step(advice.action)
             if is_placed:
                 return Attempt(step, False)
@@ -133,7 +147,7 @@ def search(walk: Walk, tried: dict[int, Attempt], holds: Holds) -> dict[int, Att
     Returns:
         `tried` and what was tried beside.
     """
-    for ways in (_backwards, _bisect):
+    for ways in (_backwards, _behind):
         last = last_step(tried, holds)
         low = -1 if last is None else last
         high = min((step for step in tried if step > low), default=None)
@@ -156,8 +170,18 @@ def _last_first(walk: Walk, steps: range, holds: Holds) -> dict[int, Attempt]:
     return behind if last_step(behind, holds) is not None else behind | {steps[0]: in_copy(walk.take_over)}
 
 
-def _bisect(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
+def _behind(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
     """The attempts of a bisection between a step that holds, or -1, and one that does not."""
+
+    def bisect_from_low() -> dict[int, Attempt]:
+        walk.go(max(low, 0))
+        return _bisect(walk, low, high, holds)
+
+    return in_copy(bisect_from_low)
+
+
+def _bisect(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
+    """The same, of a walk that is at the lower step."""
     if high - low < 2:
         return {}
     middle = (low + high) // 2
