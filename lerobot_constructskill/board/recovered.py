@@ -23,12 +23,11 @@ VERSION = 1
 FAILED = 0
 """In `Recovery.took`: the expert did not place."""
 
-
 STRIDES = 10
 """Parts of an episode, at whose beginnings the search tries from the back."""
 
 PATIENCE = 40
-"""Steps in a row, 2 s, for which advice is hopeless before the expert gives up: an object may still fall or roll."""
+"""Steps, 2 s, for which advice is hopeless or nothing moves before the expert gives up: an object may fall or roll."""
 
 
 class Lost(StrEnum):
@@ -73,7 +72,7 @@ class Recovery:
         setting, training_seed, evaluation_seed: the episode's.
         steps: how many it had.
         lost: one of `Lost`.
-        is_drawn: whether every tenth step was tried too, to check bisection.
+        is_drawn: whether every tenth step was tried too, to check the search.
         is_hopeless: whether the expert gives up one step after the last: the episode is lost to this expert.
         last_step: the last step from which the expert places within the steps that are left; None if there is none.
         last_step_extra: the same if it may go on after the episode's end.

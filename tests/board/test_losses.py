@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_constructskill.analysis.stats.comparisons import association
-from lerobot_constructskill.board.causes import cause
+from lerobot_constructskill.board.causes import GRASPED, cause
 from lerobot_constructskill.board.entries import read_entries
 from lerobot_constructskill.board.losses import Losses, by_setting, checked
 from lerobot_constructskill.board.recovered import MEANING, Lost, Recovery, path_of, write_recovered
@@ -72,7 +72,7 @@ def test_what_was_lost(case):
 
 
 def test_every_loss_has_a_meaning_and_is_met():
-    assert {*MEANING} == {*Lost}
+    assert {*MEANING} == {*Lost} and f" {1000 * GRASPED:.0f} mm " in MEANING[Lost.OFF_CENTRE]
     assert {case[-1] for case in CASES.values()} == {*Lost} - {Lost.UNSEEN}
 
 
