@@ -27,7 +27,7 @@ PUSHING = STILL + np.array([0.0123, 0, 0, 0], np.float32)
 
 
 class Pushed(gym_env.ConstructSkillEnv):
-    """An environment in which one action puts the object beside the robot's foot; the expert never takes it."""
+    """An environment in which an action that no expert takes puts the object beside the robot's foot."""
 
     def step(self, action):
         if np.array_equal(action, PUSHING):
