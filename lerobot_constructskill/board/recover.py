@@ -109,7 +109,7 @@ def recover_episode(env: ConstructSkillEnv, claim: Claim, drawn: bool = False) -
         tried = search(walk, tried, holds)
     last = last_step(tried, with_extra_time)
     after = tried.get(0 if last is None else last + 1)
-    found = {
+    found: dict[str, Any] = {
         "last_step": last_step(tried, in_time(claim)),
         "last_step_extra": last,
         "lost": cause(states, claim.executed[:, -1], last),
