@@ -63,7 +63,7 @@ def source(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
             dataset.add_frame(
                 {
                     "observation.images.base": frame,
-                    "observation.images.wrist": frame,
+                    "observation.images.wrist": 255 - frame,
                     "observation.state": rng.normal(size=8).astype(np.float32),
                     "action": np.array([*rng.uniform(-0.05, 0.05, 3), 1.0], dtype=np.float32),
                     "phase": "LIFT",
@@ -156,6 +156,30 @@ def test_patch_features_on_request(source, weights, tmp_path):
     assert patches.shape == (sum(LENGTHS), 196, 192) and patches.dtype == np.float16
     np.testing.assert_allclose(patches, expected, atol=1e-2)
     assert len(LeRobotDataset("local/out", root=tmp_path / "out")) == sum(LENGTHS)
+
+
+@pytest.mark.slow
+def test_several_cameras_stand_one_after_the_other_and_a_policy_trains_on_them(source, weights, tmp_path):
+    sets, patches = {}, {}
+    for camera in ("base", "wrist", "base+wrist"):
+        out = encode(settings(source, weights, tmp_path / camera, camera=camera, patches=True))
+        sets[camera] = LeRobotDataset("local/features", root=out)
+        patches[camera] = open_patches(out).clone()
+    names = {camera: f"observation.features.{camera}" for camera in sets}
+    pooled = {
+        camera: torch.tensor(np.stack(one.hf_dataset.with_format("numpy")[names[camera]]))
+        for camera, one in sets.items()
+    }
+    assert torch.equal(pooled["base+wrist"], torch.cat([pooled["base"], pooled["wrist"]], dim=1))
+    assert torch.equal(patches["base+wrist"], torch.cat([patches["base"], patches["wrist"]], dim=1))
+    config = policy_config(weights, camera="base+wrist", readout="spatial_softmax")
+    policy = make_policy(config, ds_meta=sets["base+wrist"].meta)
+    frame = {name: value[None] for name, value in sets["base+wrist"][0].items() if torch.is_tensor(value)}
+    seen = {
+        f"observation.images.{camera}": source[0][f"observation.images.{camera}"][None] for camera in ("base", "wrist")
+    }
+    torch.testing.assert_close(policy.head_inputs(frame)[0].float(), policy.head_inputs(seen)[0], atol=1e-2, rtol=1e-2)
+    close_patches()
 
 
 @pytest.mark.slow
