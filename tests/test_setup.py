@@ -92,8 +92,8 @@ def test_a_bare_machine_is_filled_and_the_second_time_nothing_is_done(machine):
     assert machine(EXTRAS="sim") == (0, "setup: ready: .venv/\n", [])
     *_, calls = machine()
     assert (
-        f"{COMPILED} -c constraints.txt -e .[sim,offline,cpu,study,bim,distributed,policies,evaluators,docs,dev]"
-        in calls
+        f"{COMPILED} -c constraints.txt "
+        "-e .[sim,offline,cpu,study,bim,language,distributed,policies,evaluators,docs,dev]" in calls
     )
     assert not any("uv venv" in call for call in calls), "other extras, the same Python"
 

@@ -119,7 +119,7 @@ def made_with(versions: Sequence[str]) -> dict[str, str]:
         versions: JSON, as rows have it.
     """
     found: dict[str, set[str]] = {}
-    for one in versions:
-        for name, version in json.loads(one).items():
+    for text in versions:
+        for name, version in json.loads(text).items():
             found.setdefault(name, set()).add(str(version))
     return {name: ", ".join(sorted(found[name])) for name in sorted(found)}

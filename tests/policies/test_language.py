@@ -104,7 +104,7 @@ def test_instructions_need_a_task_in_the_batch(told, images):
     ("fields", "sentence"),
     [
         ({"language": "latin"}, "language must be one of number, minilm or hf/"),
-        ({"language_fusion": "film"}, "language_fusion says how the instruction enters, and language is null"),
+        ({"language": "minilm", "language_fusion": "add"}, "language_fusion must be one of film, concat"),
         ({"camera": "base+base"}, "camera names one twice"),
         ({"camera": "base+wrist", "readout": "heat_maps"}, "finds points in the picture of one camera"),
     ],

@@ -21,7 +21,7 @@ TRANSLATION_NAMES = ("dx", "dy", "dz")
 ROTATION_NAMES = ("droll", "dpitch", "dyaw")
 GRIPPER_NAME = "gripper"
 GRIPPER_HEADS = ("bce", "regression")
-FUSIONS = ("concat", "film")
+FUSIONS = ("film", "concat")
 REGRESSION_LOSSES = ("mse", "l1")
 
 LARGEST_EXPONENT = 80
@@ -79,8 +79,8 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             of a sentence that was trained on; or not at all (None).
         language_sha256: hash that the sentence encoder's weights must have; None takes those that are found. A
             checkpoint records it in `encoder.json`.
-        language_fusion: where the instruction enters: "concat" beside what the readout found and the state, or "film",
-            which scales and shifts what the readout found (Perez et al. 2018).
+        language_fusion: where the instruction enters: "film" scales and shifts what the readout found (Perez et al.
+            2018), "concat" stands beside it and the state.
         sentences: the instructions that it is trained on, each with its rewordings, written from the data set.
         head_hidden_dim: width of the hidden layers (GELU) in each of the two heads; None makes them linear, as the
             paper does.
@@ -137,7 +137,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     use_state: bool = False
     language: Text | None = None
     language_sha256: Annotated[str, Pattern("[0-9a-f]{64}", "64 hexadecimal digits")] | None = None
-    language_fusion: Annotated[str, Among(FUSIONS)] = "concat"
+    language_fusion: Annotated[str, Among(FUSIONS)] = "film"
     sentences: list[list[str]] | None = None
     head_hidden_dim: Annotated[int, Range(1, 65_536)] | None = None
     head_hidden_layers: Annotated[int, Range(1, 16)] = 1
@@ -189,10 +189,6 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             (
                 len({*self.cameras}) < len(self.cameras),
                 f"camera names one twice: {self.camera}.",
-            ),
-            (
-                self.language is None and self.language_fusion != "concat",
-                "language_fusion says how the instruction enters, and language is null: name a sentence encoder.",
             ),
             (
                 self.point_weight != 1 and not READOUTS[self.readout].points,

@@ -31,7 +31,8 @@ class ChunkHeads(nn.Module):
         self.readout = in_each(len(config.cameras), spec, feature_dim)
         read_dim = len(config.cameras) * spec.dim(feature_dim)
         self.side_dims = (config.input_features[OBS_STATE].shape[0] if config.use_state else 0), sentence_dim
-        self.film = _no_change(sentence_dim, read_dim) if config.language_fusion == "film" else None
+        scales = config.language_fusion == "film" and sentence_dim > 0
+        self.film = _no_change(sentence_dim, read_dim) if scales else None
         input_dim = read_dim + self.side_dims[0] + (0 if self.film else sentence_dim)
         hidden = [config.head_hidden_dim] * config.head_hidden_layers if config.head_hidden_dim else []
         self.translation = _head(input_dim, hidden, self.chunk_shape[0] * self.chunk_shape[1])
