@@ -471,6 +471,11 @@ LOOSE = "constructskill"
 """Name under which the results of tasks that were chosen one by one are kept."""
 
 
+def list_tasks(names: str, action: str = TASK_ACTION) -> list[Task]:
+    """The rows that `names` asks for, in its order. Arguments and errors are those of `select_tasks`."""
+    return [row for suite in select_tasks(names, action).values() for row in suite]
+
+
 def select_tasks(names: str, action: str = TASK_ACTION) -> dict[str, list[Task]]:
     """The rows that `names` asks for, by suite.
 

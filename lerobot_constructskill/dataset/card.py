@@ -16,7 +16,7 @@ from lerobot_constructskill.contract import (
     ROTATION,
     TASK_ACTION,
     held_out,
-    select_tasks,
+    list_tasks,
     state_names,
 )
 from lerobot_constructskill.dataset.dataset import DataSet, check_provenance_fields
@@ -134,8 +134,7 @@ def _action_range(data: DataSet) -> dict[str, list[float]]:
 def render(facts: dict[str, Any]) -> str:
     """The card of a data set with these facts, in Markdown with the Hub's front matter."""
     generator = facts["generator"]
-    selected = select_tasks(generator["task"], generator.get("action", TASK_ACTION))
-    tasks = [task for suite in selected.values() for task in suite]
+    tasks = list_tasks(generator["task"], generator.get("action", TASK_ACTION))
     columns = dagger_features if "dagger" in facts else demonstration_features
     seen, state = generator.get("cameras") or OBS_TYPES[generator["obs_type"]], state_names(generator["obs_type"])
     features = as_made(columns(tasks[0], seen, state), bool(facts.get("joints")), bool(facts.get("placements")))

@@ -15,7 +15,7 @@ from lerobot_constructskill.contract import (
     OBS_TYPES,
     TASK_ACTION,
     Task,
-    select_tasks,
+    list_tasks,
     state_names,
 )
 from lerobot_constructskill.demos.columns import demonstration_features
@@ -91,7 +91,7 @@ class GenerateConfig:
 
     def __post_init__(self):
         check(self)
-        select_tasks(self.task, self.action)
+        list_tasks(self.task, self.action)
         if self.cameras is not None and not (self.cameras and {*self.cameras} <= {*OBS_TYPES[self.obs_type]}):
             raise InputError(
                 f"cameras must be some of {', '.join(OBS_TYPES[self.obs_type])}, which {self.obs_type} has, not "
@@ -101,7 +101,7 @@ class GenerateConfig:
     @property
     def rows(self) -> list[Task]:
         """The tasks, whose actions are as asked for."""
-        return [row for suite in select_tasks(self.task, self.action).values() for row in suite]
+        return list_tasks(self.task, self.action)
 
     @property
     def parts(self) -> list["GenerateConfig"]:

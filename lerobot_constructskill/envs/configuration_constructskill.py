@@ -17,6 +17,7 @@ from lerobot_constructskill.contract import (
     OBS_TYPES,
     PLANNED,
     TASK_ACTION,
+    list_tasks,
     select_tasks,
     state_names,
 )
@@ -75,7 +76,7 @@ class ConstructSkillEnvConfig(EnvConfig):
                 raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")
             if self.vectorization == "native":
                 check_unperturbed(self.perturb)
-            rows = [row for suite in select_tasks(self.task, self.action).values() for row in suite]
+            rows = list_tasks(self.task, self.action)
             for row in rows:
                 perturbed_task(row.name, self.perturb, self.perturb_seed)
         image = PolicyFeature(FeatureType.VISUAL, (IMAGE_SIZE, IMAGE_SIZE, 3))

@@ -22,6 +22,7 @@ from lerobot_constructskill.policies.frozen_vit.encoder import Crop, FrozenEncod
 from lerobot_constructskill.policies.frozen_vit.feature_sets import (
     PATCHES_FILE,
     bind_patches,
+    cameras_of,
     describe,
     feature_key,
     point_key,
@@ -110,7 +111,7 @@ def write_feature_set(
     # All that decides the content is in the folder's name, so parts of other encoders are never taken.
     each = {
         name: folder.with_name(PARTS) / digest({**info, "camera": name, "patches": patches})
-        for name in camera.split("+")
+        for name in cameras_of(camera)
     }
     made = [_encode_frames(dataset, name, encoder, batch_size, parts, patches) for name, parts in each.items()]
     columns = {feature_key(camera): np.concatenate(made, axis=1), **found}

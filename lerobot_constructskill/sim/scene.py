@@ -368,6 +368,14 @@ class PickPlaceEnv(BaseEnv):
         quaternion = torch.stack([torch.cos(half_yaw), zero, zero, torch.sin(half_yaw)], dim=-1)
         self.object.set_pose(Pose.create_from_pq(position, quaternion))
 
+    def _stand(self, actor: Actor, places: np.ndarray, heights: float | torch.Tensor) -> None:
+        """Set an actor upright on places (len(env_idx), 2), its origin at a height, or one for each, in metres."""
+        position = torch.zeros(len(places), 3)
+        position[:, :2] = torch.from_numpy(places)
+        position[:, 2] = heights
+        upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(places), 1)
+        actor.set_pose(Pose.create_from_pq(position, upright))
+
     def _initial_qpos(self, env_idx: torch.Tensor) -> np.ndarray:
         """Joint positions of the rest keyframe, with noise where the pose is perturbed, (9,) or (len(env_idx), 9)."""
         rest, amount = self.agent.keyframes["rest"].qpos, self.draws.perturbation.amount("pose")

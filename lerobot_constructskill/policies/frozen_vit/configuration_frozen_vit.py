@@ -12,7 +12,7 @@ from lerobot_constructskill.errors import InputError, as_field_error
 from lerobot_constructskill.lerobot_internals import CosineAnnealingWithWarmupSchedulerConfig
 
 from .backbones import IMAGE_SIZE, check_backbone
-from .feature_sets import feature_key, point_key
+from .feature_sets import cameras_of, feature_key, point_key
 from .language import check_language
 from .precision import AUTO, PRECISIONS
 from .readouts import READOUTS
@@ -221,7 +221,7 @@ class FrozenViTChunkConfig(PreTrainedConfig):
     @property
     def cameras(self) -> list[str]:
         """The cameras, in the order in which the heads see them."""
-        return self.camera.split("+")
+        return cameras_of(self.camera)
 
     @property
     def image_keys(self) -> list[str]:

@@ -25,8 +25,13 @@ BOUND = "patches_sha256"
 """Entry of a feature column's description: hash of the patch features that belong to it, as of `_identity`."""
 
 
+def cameras_of(camera: str) -> list[str]:
+    """The cameras that a policy's `camera` names, `base+wrist` or one alone, in the order in which they are read."""
+    return camera.split("+")
+
+
 def feature_key(camera: str) -> str:
-    """Column that holds the encoded frames of `camera`, (D,) float32."""
+    """Column that holds the encoded frames of `camera`, (D,) float32; of several they stand one after the other."""
     return FEATURE_PREFIX + camera
 
 

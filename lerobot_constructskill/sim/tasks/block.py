@@ -1,5 +1,7 @@
 """Concrete block to bin: the extension promise, one asset, four geometry constants and its initial states."""
 
+from collections.abc import Sequence
+
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
 
@@ -36,5 +38,14 @@ class BlockToBinEnv(PickPlaceEnv):
     yaw_range = 0.0
 
     def _load_object(self, builder: ActorBuilder) -> None:
-        concrete = mottled((196, 194, 188), contrast=0.08)
-        self._add_box(builder, [0, 0, 0], self.object_size, concrete, AERATED_CONCRETE_DENSITY)
+        add_block(self, builder, self.object_size)
+
+
+def add_block(env: PickPlaceEnv, builder: ActorBuilder, size: Sequence[float]) -> None:
+    """Add a block to an actor, its middle at the actor's origin.
+
+    Args:
+        size: edges in metres, (3,).
+    """
+    concrete = mottled((196, 194, 188), contrast=0.08)
+    env._add_box(builder, [0, 0, 0], size, concrete, AERATED_CONCRETE_DENSITY)

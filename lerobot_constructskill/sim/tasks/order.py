@@ -7,14 +7,13 @@ import sapien
 import torch
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor
 
 from lerobot_constructskill.contract import BRICK, ORDERS, TASKS
 from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.scene import WALL, PickPlaceEnv
-from lerobot_constructskill.sim.tasks.block import AERATED_CONCRETE_DENSITY, BLOCK
+from lerobot_constructskill.sim.tasks.block import BLOCK, add_block
 from lerobot_constructskill.sim.tasks.brick import add_brick
-from lerobot_constructskill.sim.visuals import mottled
 
 SIZES = {"brick": BRICK, "block": BLOCK}
 """Objects and their sizes in metres."""
@@ -83,8 +82,7 @@ class OrderEnv(PickPlaceEnv):
         if name == "brick":
             add_brick(self, builder, 0.0, SIZES[name])
         else:
-            concrete = mottled((196, 194, 188), contrast=0.08)
-            self._add_box(builder, [0, 0, 0], SIZES[name], concrete, AERATED_CONCRETE_DENSITY)
+            add_block(self, builder, SIZES[name])
 
     # Initial state
 
@@ -97,12 +95,6 @@ class OrderEnv(PickPlaceEnv):
             self._stand(one, places, SIZES[name][2] / 2)
         for number, one in enumerate(self.all_bins.values()):
             self._stand(one, np.array(BIN_PLACES)[order[:, 1] ^ number], WALL + self.bin_interior[2] / 2)
-
-    def _stand(self, actor: Actor, places: np.ndarray, height: float) -> None:
-        """Set an actor upright on places (len(env_idx), 2), its origin at a height in metres."""
-        positions = np.column_stack([places, np.full(len(places), height)])
-        upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(places), 1)
-        actor.set_pose(Pose.create_from_pq(torch.from_numpy(positions).float().to(self.device), upright))
 
     # Success
 

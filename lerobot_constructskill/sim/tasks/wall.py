@@ -8,7 +8,7 @@ import sapien
 import torch
 from mani_skill.utils.building import ActorBuilder
 from mani_skill.utils.registration import register_env
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor
 
 from lerobot_constructskill.contract import PLAN_TASK, SHIPPED
 from lerobot_constructskill.plans.check import check_plan
@@ -125,12 +125,9 @@ class WallEnv(PickPlaceEnv):
     def _initialize_objects(self, env_idx: torch.Tensor) -> None:
         rng = self._batched_episode_rng[env_idx]
         offsets = np.reshape(rng.uniform(-1, 1, size=(len(self.objects), 2)), (-1, len(self.objects), 2))
+        heights = self._sizes[env_idx, :, 2] / 2
         for number, place in enumerate(supplies(self.plan)):
-            position = torch.zeros(len(env_idx), 3)
-            position[:, :2] = torch.from_numpy(np.array(place) + self.spawn_range * offsets[:, number])
-            position[:, 2] = self._sizes[env_idx, number, 2] / 2
-            upright = torch.tensor([[1.0, 0, 0, 0]]).repeat(len(env_idx), 1)
-            self.objects[number].set_pose(Pose.create_from_pq(position, upright))
+            self._stand(self.objects[number], place + self.spawn_range * offsets[:, number], heights[:, number])
 
     # Success
 
