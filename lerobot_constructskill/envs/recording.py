@@ -134,7 +134,8 @@ class Episode:
     @property
     def action(self) -> str:
         """The form of its actions, one of `contract.ACTIONS`, as their length tells."""
-        return ANY_ACTION if self.steps and len(self.flat) == len(FULL_ACTION) * self.steps else TASK_ACTION
+        numbers = sum(map(len, self.actions))
+        return ANY_ACTION if self.steps and numbers == len(FULL_ACTION) * self.steps else TASK_ACTION
 
     @property
     def flat(self) -> np.ndarray:

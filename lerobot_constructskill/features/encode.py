@@ -151,16 +151,17 @@ def _join_files(files: Sequence[Sequence[Path]], frames: int, joined: Path) -> N
     """Write the rows of files of patch features into one of so many frames.
 
     Args:
-        files: those of each episode, or each part, of which one is open at a time; one a camera.
+        files: those of each episode, or each part, of which one is open at a time; one a camera. One alone, which may
+            be larger than the memory, is not loaded.
     """
-    rows = (np.concatenate([np.load(file, mmap_mode="r") for file in own], axis=1) for own in files)
+    opened = ([np.load(file, mmap_mode="r") for file in own] for own in files)
     first = [np.load(file, mmap_mode="r").shape for file in files[0]]
     shape = (frames, sum(patches for _, patches, _ in first), first[0][2])
     header = {"descr": np.lib.format.dtype_to_descr(np.dtype(np.float16)), "fortran_order": False, "shape": shape}
     with joined.open("wb") as out:  # a full disk raises here; under a memory map it would kill the process
         np.lib.format.write_array_header_1_0(out, header)
-        for some in rows:
-            out.write(some)
+        for own in opened:
+            out.write(own[0] if len(own) == 1 else np.concatenate(own, axis=1))
 
 
 def _source(dataset: LeRobotDataset) -> dict[str, str]:

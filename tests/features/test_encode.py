@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -393,6 +394,18 @@ def test_a_study_takes_the_weights_whose_hash_it_names_or_none(weights):
     assert settle(policy_config(weights, backbone_sha256=found))[0].backbone_sha256 == found
     with pytest.raises(InputError, match="weights asked for have sha256 000000000000, but local tiny.safetensors has"):
         settle(policy_config(weights, backbone_sha256="0" * 64))
+
+
+def test_a_file_that_is_joined_alone_is_not_loaded(tmp_path):
+    """Parts of a merged set have gigabytes each."""
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.full((64, 400, 400), ord(name), np.float16))
+    tracemalloc.start()
+    features_encode._join_files([[tmp_path / "a.npy"], [tmp_path / "b.npy"]], 128, tmp_path / "joined.npy")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    joined = np.load(tmp_path / "joined.npy", mmap_mode="r")
+    assert peak < 4 << 20 and (joined[63, 0, 0], joined[64, 0, 0], len(joined)) == (ord("a"), ord("b"), 128)
 
 
 def test_frames_are_decoded_ahead_in_order_until_one_cannot_be():

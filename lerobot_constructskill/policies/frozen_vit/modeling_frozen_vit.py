@@ -27,7 +27,7 @@ from .feature_sets import check_features, describe, open_patches, stated
 from .heads import ChunkHeads, heads_loss
 from .language import Told, sentences_of
 from .precision import PRECISIONS, RUNTIMES, check_native, resolve_precision
-from .readouts import READOUTS
+from .readouts import READOUTS, beside
 from .shared_encoder import POOLED, SharedEncoders
 from .weights import load_weights, read_tensors, state_sha256
 
@@ -354,10 +354,10 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
             patches = patches if self.readout.learns else patches.to(cls)
             cameras = len(self.config.cameras)
             each = zip(cls.chunk(cameras, dim=1), patches.chunk(cameras, dim=1), strict=True)
-            return torch.cat([self.readout.pool(*own) for own in each], dim=1)
+            return beside([self.readout.pool(*own) for own in each])
         keys = self.config.image_keys
         if all(key in batch for key in keys):
-            return torch.cat([self.pool(batch[key]) for key in keys], dim=1)
+            return beside([self.pool(batch[key]) for key in keys])
         raise InputError(
             f"frozen_vit needs {' and '.join(keys)} or {self.config.feature_key}; the batch holds: "
             f"{', '.join(batch)}. obs_type=pixels_agent_pos shows the wrist camera and the state as well."

@@ -240,6 +240,11 @@ READOUTS = {
 }
 
 
+def beside(parts: Sequence[Tensor]) -> Tensor:
+    """What is taken of each camera's tokens, (B, ...), one after the other; of one camera as it is, without a copy."""
+    return parts[0] if len(parts) == 1 else torch.cat([*parts], dim=1)
+
+
 def in_each(cameras: int, readout: Readout, dim: int) -> nn.Module:
     """What trains of a readout of so many cameras, for an encoder's features of length `dim`."""
     if readout.build is None:

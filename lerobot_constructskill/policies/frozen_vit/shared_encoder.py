@@ -11,6 +11,7 @@ from torch import Tensor
 from lerobot_constructskill.threads import one_thread
 
 from .feature_sets import describe
+from .readouts import beside
 
 POOLED = "observation.pooled"
 """Entry of a batch beside the image: what `FrozenViTChunkPolicy.pool` returns for it."""
@@ -46,7 +47,7 @@ class SharedEncoders:
             numbers = [number for number in own if all(key in batches[number] for key in keys)]
             try:
                 each = [cache.pool([batches[number][key] for number in numbers]) for key in keys]
-                pooled = [torch.cat(parts, dim=1) for parts in zip(*each, strict=True)]
+                pooled = [beside(parts) for parts in zip(*each, strict=True)]
             except Exception as error:
                 seen |= dict.fromkeys(numbers, error)
                 continue
