@@ -97,9 +97,8 @@ def test_a_study_is_runs_that_can_be_made(path):
         assert all(run.arm.env["task"] in names for names in learnt)
 
 
-@pytest.mark.parametrize("name", ["perturbed", "perturbed_paper"])
-def test_a_perturbed_study_has_every_level_of_the_boards_axes_beside_the_task_as_it_is(name):
-    study = parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml")
+def test_the_perturbed_study_has_every_level_of_the_boards_axes_beside_the_task_as_it_is():
+    study = parse(StudyConfig, [], CONFIGS / "study" / "perturbed.yaml")
     levels = {axis: range(1, len(AXES[axis].levels) + 1) for axis in PERTURBED_AXES}
     sweeps = {axis: ["control", *(f"{axis}_{level}" for level in those)] for axis, those in levels.items()}
     assert study.analysis.sweeps == sweeps
@@ -118,24 +117,6 @@ def test_no_two_sets_of_a_setting_are_one(path):
             parse_named(GenerateConfig, "generate", data, ["--repo_id=local/set"]) for data in study.data_of(setting)
         ]
         assert not [(a, b) for a, b in combinations(configs, 2) if a == b]
-
-
-def test_a_part_of_the_precise_recipe_is_taken_out_of_its_set_alone():
-    study = parse(StudyConfig, [], CONFIGS / "study" / "precise_parts.yaml").study
-    sets = {run.arm.name: run.arm.demonstrations.node.config for run in list_runs(study)}
-    precise, av1, quiet = (sets[name] for name in ("precise", "av1_video", "quiet_release"))
-    assert replace(av1, video="lossless") == precise != av1
-    assert replace(quiet, noise=precise.noise) == precise != quiet
-
-
-def test_the_dose_response_is_six_doses_of_one_set():
-    study = parse(StudyConfig, [], CONFIGS / "study" / "dart_dagger.yaml").study
-    runs = [run for run in list_runs(study) if run.arm.setting == "frames_4k" and run.arm.demonstrations]
-    sets = {run.arm.name: run.arm.demonstrations.node.config for run in runs}
-    doses = {0: "clean", 10: "fixed"} | {millimetres: f"sigma_{millimetres}mm" for millimetres in (2, 5, 20, 30)}
-    fixed = sets["fixed"]
-    for millimetres, name in doses.items():
-        assert sets[name] == replace(fixed, noise=replace(fixed.noise, sigma=millimetres / 1000))
 
 
 def seeds_of(runs):
@@ -186,27 +167,13 @@ def test_the_papers_recipe_is_the_papers():
     assert Study.__dataclass_fields__["episodes"].default == 10
 
 
-def test_the_ladders_study_is_the_precise_recipe_on_the_boards_suite():
-    precise, ladder = (
-        parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study for name in ("precise", "ladder")
-    )
-    assert (ladder.variants, ladder.training) == (precise.variants, precise.training)
-    for name, setting in BOARD_SUITES["ladder"].settings.items():
-        fields = ladder.settings[name].env
+@pytest.mark.parametrize("suite", ["ladder", "joints"])
+def test_the_precise_study_has_the_boards_settings(suite):
+    precise = parse(StudyConfig, [], CONFIGS / "study" / "precise.yaml").study
+    for name, setting in BOARD_SUITES[suite].settings.items():
+        fields = precise.settings[name].env
         assert (fields["task"], fields["episode_length"]) == (setting.task, setting.episode_length)
-        assert range(ladder.eval_seed, ladder.eval_seed + ladder.episodes) == setting.starts
-    assert ladder.settings.keys() == BOARD_SUITES["ladder"].settings.keys()
-
-
-def test_the_parts_of_the_precise_recipe_are_those_that_tell_it_from_the_suites():
-    precise, parts, suite = (
-        parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study
-        for name in ("precise", "precise_parts", "suite")
-    )
-    whole, before = (study.variants[name].policy for study, name in ((parts, "precise"), (parts, "as_before")))
-    assert whole == precise.variants["precise"].policy and parts.training == precise.training
-    only = suite.variants["wrist_state_hidden"].policy
-    assert before == {**only, "head_hidden_layers": 1, "regression_loss": "mse"}
+        assert range(precise.eval_seed, precise.eval_seed + precise.episodes) == setting.starts
 
 
 @pytest.fixture
@@ -245,8 +212,8 @@ def test_a_policy_that_is_not_there_is_refused_with_those_that_are(study_of):
 
 
 def test_cut_to_fewer_seeds_every_variant_and_reference_has_them():
-    cut = parse(StudyConfig, ["--seeds=4"], CONFIGS / "study" / "dense.yaml").study
-    assert {variant.seeds for variant in cut.variants.values()} == {4} and max(cut.references.values()) == 4
+    cut = parse(StudyConfig, ["--seeds=2"], CONFIGS / "study" / "representation.yaml").study
+    assert {variant.seeds for variant in cut.variants.values()} == {2} and max(cut.references.values()) == 2
 
 
 def test_no_two_generation_configs_make_the_same_set():

@@ -126,8 +126,8 @@ def test_an_installed_copy_finds_its_configurations_from_an_empty_folder(built: 
     surroundings = os.environ | {"PYTHONPATH": str(installed)}
     done = subprocess.run(command, env=surroundings, cwd=elsewhere, capture_output=True, text=True)
     assert done.stdout.rstrip() == show(), done.stderr
-    one = subprocess.run([*command, "study/act"], env=surroundings, cwd=elsewhere, capture_output=True, text=True)
-    assert one.stdout.strip() == str(installed / "lerobot_constructskill" / "configs" / "study" / "act.yaml")
+    one = subprocess.run([*command, "study/paper"], env=surroundings, cwd=elsewhere, capture_output=True, text=True)
+    assert one.stdout.strip() == str(installed / "lerobot_constructskill" / "configs" / "study" / "paper.yaml")
     assert presets.FOLDER == REPOSITORY / "configs", "a checkout reads its own files"
 
 
@@ -136,7 +136,7 @@ def test_every_configuration_has_a_name_and_says_what_it_is() -> None:
     assert named == set((REPOSITORY / "configs").rglob("*.yaml"))
     lines = show().splitlines()
     assert len(lines) == len(named) and all(len(line.split()) > 3 for line in lines)
-    assert show("study/act") == str(REPOSITORY / "configs" / "study" / "act.yaml")
+    assert show("study/paper") == str(REPOSITORY / "configs" / "study" / "paper.yaml")
 
 
 def test_a_name_wins_over_a_file_called_like_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,9 +15,12 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 README_LINES = 150
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+NOTES = sorted((ROOT / "results").glob("**/*.md"))
+
+
+@pytest.mark.parametrize("page", [*PAGES, *NOTES], ids=lambda page: f"{page.parent.name}/{page.name}")
 def test_links_of_a_page_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)]+)\)", page.read_text())
+    links = re.findall(r"\]\(([^) ]+)[^)]*\)", page.read_text())
     assert not [link for link in links if "://" not in link and not leads_somewhere(page, *link.partition("#")[::2])]
 
 

@@ -1,5 +1,6 @@
 """The published results are what their rows say."""
 
+import importlib.util
 import re
 import shutil
 from pathlib import Path, PurePosixPath
@@ -15,6 +16,11 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/study.yaml"))
+
+
+SPEC = importlib.util.spec_from_file_location("render", ROOT / "results" / "render.py")
+render = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(render)
 
 
 def one_and_nightly_the_others() -> list:
@@ -70,3 +76,24 @@ def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     assert (copy / "report.md").read_text() == text
     for figure in re.findall(r"\]\((figures/.+)\)", text):
         assert np.array_equal(imread(copy / figure), imread(folder / figure))
+
+
+@pytest.mark.parametrize("page", render.PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
+def test_the_numbers_of_a_page_are_those_of_the_rows(page):
+    assert render.render(page) == page.read_text(), "run: python results/render.py"
+    assert not render.literals(page)
+
+
+def test_a_number_that_comes_from_no_rows_is_found(tmp_path):
+    link = f'[precise]({ROOT}/results/precise/report.md "tile_to_grid/precise")'
+    page = tmp_path / "page.md"
+    page.write_text(f"| task | placed | rows |\n|---|---:|---|\n| tile | 1/500 | {link} |\n| other | 3/500 | |\n")
+    assert f"| tile | 397/500 | {link} |" in render.render(page)
+    assert render.literals(page) == ["| other | 3/500 | |"]
+
+
+def test_an_arm_that_nobody_made_is_no_number(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f'[]({ROOT}/results/orders/report.md "placed brick_to_grey/number")\n')
+    with pytest.raises(SystemExit, match=r"has no run of brick_to_grey/number that was made"):
+        render.render(page)

@@ -1,0 +1,164 @@
+"""Writes the numbers of result tables in pages from the rows of studies: `python results/render.py`.
+
+A row of a table with a link to a report, whose title names an arm (setting/variant), has its numbers from there, each
+column by its head (`HEADS`). A link whose title begins with one of `WORDS` has that number as its text:
+
+    | finer maps | 489/500 | 68 to 99 | [precise](results/precise/report.md "brick_to_bin_shifted/precise") |
+    | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |
+"""
+
+import json
+import re
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import pandas as pd
+
+from lerobot_constructskill.analysis.report.formats import percent
+from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
+from lerobot_constructskill.analysis.stats.outcomes import by_draw, count, runs_of
+from lerobot_constructskill.study.rows import ROWS, read_draws, read_rows
+
+ROOT = Path(__file__).parents[1]
+
+PAGES = [ROOT / "README.md", ROOT / "docs" / "results.md", *sorted((ROOT / "results").glob("*/notes.md"))]
+
+LINK = re.compile(r'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>\w+) )?(?P<arm>\w+/\w+)"\)')
+
+OFTEN = ["", "", " (two)", " (three)", " (four)", " (five)", " (six)", " (seven)", " (eight)", " (nine)", " (ten)"]
+
+
+class Arm:
+    """What the rows of a study say of one variant in one setting."""
+
+    def __init__(self, folder: Path, name: str):
+        setting, variant = name.split("/")
+        rows = _rows(folder)
+        self.rows = rows[(rows["setting"] == setting) & (rows["variant"] == variant)]
+        self.runs = runs_of(self.rows)
+        if self.runs.empty:
+            raise SystemExit(f"{folder / ROWS} has no run of {name} that was made.")
+        self.draws = [read_draws(folder).of(seed) for seed in self.runs["training_seed"]]
+
+    def met(self, criterion: str) -> str:
+        return f"{self.runs[criterion].sum()}/{self.runs['episodes'].sum()}"
+
+    def seeds(self, criterion: str) -> str:
+        counts = count(self.runs[f"{criterion}_rate"].to_numpy())
+        return f"{counts.met}/{counts.seeds}"
+
+    def seeds_with_interval(self) -> str:
+        counts = count(self.runs["placed_rate"].to_numpy())
+        return f"{counts.met}/{counts.seeds} ({_range(clopper_pearson(counts))} %)"
+
+    @property
+    def mean(self) -> Estimate:
+        return mean_rate(by_draw(self.runs["placed_rate"], self.draws))
+
+    def episodes(self) -> str:
+        return f"{self.met('placed')}: {percent(self.mean.value)} ({_range(self.mean)})"
+
+    def each(self) -> str:
+        often = Counter(sorted(self.runs["placed"]))
+        return ", ".join(f"{placed}{OFTEN[min(times, 10)]}" for placed, times in often.items())
+
+    def in_order(self) -> str:
+        return ", ".join(map(str, self.runs["placed"]))
+
+    def error(self) -> str:
+        errors = 1e4 * self.runs["heldout_mse_m2"].dropna()
+        return f"{errors.mean():.2f} [{errors.min():.2f} to {errors.max():.2f}]" if len(errors) else "–"
+
+    def cpu(self) -> str:
+        told = {json.loads(versions).get("processor") or "not recorded" for versions in self.rows["versions"].dropna()}
+        return " and ".join(sorted({re.sub(r"\(R\)| Processor| \(.*", "", name) for name in told}))
+
+
+WORDS: dict[str, Callable[[Arm], str]] = {
+    "placed": lambda arm: arm.met("placed"),
+    "count": lambda arm: arm.met("placed").split("/")[0],
+    "lifted": lambda arm: arm.met("lifted"),
+    "seeds": lambda arm: arm.seeds("placed"),
+    "each": Arm.in_order,
+}
+"""Of links."""
+
+HEADS: dict[str, Callable[[Arm], str]] = {
+    "placed": lambda arm: arm.met("placed"),
+    "lifted": lambda arm: arm.met("lifted"),
+    "interval, %": lambda arm: _range(arm.mean),
+    "episodes placed (mean over seeds, 95 % interval)": Arm.episodes,
+    "seeds that placed": lambda arm: arm.seeds("placed"),
+    "seeds that lifted": lambda arm: arm.seeds("lifted"),
+    "seeds that placed (interval)": Arm.seeds_with_interval,
+    "each seed": Arm.each,
+    "held-out error, 1e-4 m2": Arm.error,
+    "CPU": Arm.cpu,
+}
+"""Of columns."""
+
+
+def render(page: Path) -> str:
+    """A page with the numbers that the rows have now.
+
+    Raises:
+        SystemExit: a link names an arm of which nothing was made.
+    """
+    return "".join(f"{text}\n" for text, _, _ in _lines(page))
+
+
+def literals(page: Path) -> list[str]:
+    """The lines of result tables with numbers that come from no rows, except for those of the paper itself."""
+    found = []
+    for text, heads, cells in _lines(page):
+        numbers = [cell for head, cell in zip(heads, cells, strict=True) if head in HEADS and not LINK.search(cell)]
+        is_of_rows = any(one["word"] is None for one in LINK.finditer(text)) or cells[:1] == ["the paper"]
+        if cells != heads and not is_of_rows and any(re.search(r"\d", number) for number in numbers):
+            found.append(text)
+    return found
+
+
+def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    """Each line as rendered; if it is one of a table, the table's heads and its cells."""
+    heads: list[str] = []
+    for line in page.read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
+        heads = (heads or cells) if cells else []
+        if cells and (row := next((one for one in LINK.finditer(line) if one["word"] is None), None)):
+            arm = _arm(_folder(page, row["file"]), row["arm"])
+            cells = [HEADS[head](arm) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)]
+            line = f"| {' | '.join(cells)} |"
+        yield LINK.sub(lambda one: _linked(page, one), line), heads, cells
+
+
+def _linked(page: Path, link: re.Match[str]) -> str:
+    if link["word"] is None:
+        return link[0]
+    text = WORDS[link["word"]](_arm(_folder(page, link["file"]), link["arm"]))
+    return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
+
+
+def _folder(page: Path, file: str) -> Path:
+    return (page.parent / file).resolve().parent
+
+
+@cache
+def _rows(folder: Path) -> pd.DataFrame:
+    return read_rows(folder / ROWS)
+
+
+_arm = cache(Arm)
+
+
+def _range(estimate: Estimate) -> str:
+    return f"{100 * estimate.low:.0f} to {100 * estimate.high:.0f}"
+
+
+if __name__ == "__main__":
+    for page in PAGES:
+        if (text := render(page)) != page.read_text(encoding="utf-8"):
+            page.write_text(text, encoding="utf-8")
+            sys.stdout.write(f"{page.relative_to(ROOT)}\n")
