@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds check test nightly mutants bench dist docs image pins
+.PHONY: help setup demo ten-seeds results check test nightly mutants bench dist docs image pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -25,6 +25,9 @@ demo: setup ## demonstrations, training, evaluation and a video, end to end
 ten-seeds: setup ## ten training seeds of frozen_vit on the fast set as a study, with its report
 	.venv/bin/constructskill-study ten_seeds
 	.venv/bin/constructskill-report --root=outputs/study/ten_seeds
+
+results: setup ## the published results that are missing or of older code, a piece at a time, each committed (MINUTES=120)
+	.venv/bin/python results/make.py $(if $(MINUTES),--minutes=$(MINUTES))
 
 check: setup ## lint, types, and the tests that need neither simulator nor training
 	.venv/bin/ruff check

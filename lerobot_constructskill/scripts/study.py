@@ -66,8 +66,8 @@ def study(config: StudyConfig) -> str:
     store = Store(config.store.absolute())
     if config.status:
         runs = list_runs(config.study)
-        return status(Table(root, runs, store), choose(runs, config.only), config.retry_failed)
-    table = run_study(config.study, _text(config), root, store, config)
+        return status(Table(root, runs, store, config.replace), choose(runs, config.only), config.retry_failed)
+    table = run_study(config.study, text_of(config), root, store, config)
     failed, missing = table.failed(), table.missing()
     made = len(table.runs) - len(missing)
     if len(failed) == made:
@@ -78,16 +78,19 @@ def study(config: StudyConfig) -> str:
     return f"{plural(made, 'run')}{lacking}{left}: {root} (next: constructskill-report --root={root})"
 
 
-def _text(config: StudyConfig) -> str:
-    """The study as it was read, with the labels of its references."""
+def text_of(config: StudyConfig) -> str:
+    """The study as it was read, with the tasks that it leaves to the default and the labels of its references."""
     import draccus
     import yaml
 
+    from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
     from lerobot_constructskill.rollout.references import REFERENCES
 
     labels = {name: REFERENCES[name].label for name in config.references if name in REFERENCES}
     analysis = replace(config.analysis, labels=labels | config.analysis.labels)
     text = {**draccus.encode(config.study), "analysis": draccus.encode(analysis)}
+    for setting in text["settings"].values():
+        setting["env"] = {"task": ConstructSkillEnvConfig.task} | setting["env"]
     return yaml.safe_dump(text, sort_keys=False, allow_unicode=True)
 
 

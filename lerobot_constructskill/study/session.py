@@ -46,7 +46,7 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
     runs = list_runs(study)
     chosen = choose(runs, options.only)
     with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
-        table = Table(root, runs, store)
+        table = Table(root, runs, store, options.replace)
         _check_nothing_is_lost(table)
         write_text(root / STUDY, text)
         facts = root / PROVENANCE
@@ -78,7 +78,7 @@ def _check_nothing_is_lost(table: Table) -> None:
         raise InputError(
             f"{table.root} has rows of {plural(len(lost), 'run')}, such as {lost[0]}, that are not of this study as "
             f"it is, or of other versions of packages or weights, and {table.store.root} does not keep them: they "
-            "would be lost. Give another --root, or move the folder away."
+            "would be lost. Give another --root, or --replace=true to make them anew."
         )
 
 

@@ -30,7 +30,7 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
         runs = list(alike)
         lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
         if own := [run for run in due if run in runs]:
-            lines.append(f"    to make: {_seeds(own)}, {_time(own, took)}")
+            lines.append(f"    to make: {_seeds(own)}, {tell_time(own, took)}")
     return "\n".join([*lines, _total(table, due, took)])
 
 
@@ -75,7 +75,7 @@ def _seeds(runs: Sequence[Run]) -> str:
     return f"{'seed' if len(runs) == 1 else 'seeds'} {', '.join(str(run.seed) for run in runs)}"
 
 
-def _time(runs: Sequence[Run], took: Mapping[str, float]) -> str:
+def tell_time(runs: Sequence[Run], took: Mapping[str, float]) -> str:
     """How long runs take, by how long the last ones of their variants took in this folder."""
     known = [took[run.arm.id] for run in runs if run.arm.id in took]
     if not known:
@@ -92,4 +92,4 @@ def _total(table: Table, due: Sequence[Run], took: Mapping[str, float]) -> str:
     used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
     absent = [name for name, data in used.items() if not table.store.has(data.node)]
     first = f"; first the demonstrations: {', '.join(absent)}" if absent else ""
-    return f"To make: {plural(len(due), 'run')}, {_time(due, took)}{first}"
+    return f"To make: {plural(len(due), 'run')}, {tell_time(due, took)}{first}"

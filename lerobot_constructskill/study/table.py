@@ -29,10 +29,12 @@ class Table:
         root: the study's folder.
         runs: its runs.
         store: where they are made.
+        replaces: whether rows that were made of something else stand until a run of their setting and variant is made,
+            and then go.
     """
 
-    def __init__(self, root: Path, runs: Sequence[Run], store: Store):
-        self.root, self.runs, self.store = root, runs, store
+    def __init__(self, root: Path, runs: Sequence[Run], store: Store, replaces: bool = False):
+        self.root, self.runs, self.store, self.replaces = root, runs, store, replaces
         file = root / ROWS
         before = [row for row in load_rows(file) if row.error_kind != NOT_RUN] if file.exists() else []
         by_run = groupby(before, key=lambda row: (row.setting, row.variant, row.run))
@@ -80,21 +82,25 @@ class Table:
 
     def outdated(self, run: Run) -> Row | None:
         """A row that the table in the folder had of this run, made of something else than it would be made of now."""
+        return next(iter(self._outdated(run)), None)
+
+    def _outdated(self, run: Run) -> list[Row]:
         ours = _keys(run)
-        alike = (rows[0] for key, rows in self._before.items() if key[:2] == ours[0][:2] and key not in ours)
-        return next((row for row in alike if row.training_seed == run.seed), None)
+        alike = (rows for key, rows in self._before.items() if key[:2] == ours[0][:2] and key not in ours)
+        return [row for rows in alike for row in rows if row.training_seed == run.seed]
 
     def lost(self) -> list[str]:
         """The names of the runs of the table in the folder that neither this study nor the store has.
 
-        One that failed is not lost where this study has a run of that name: now its weights may be there.
+        One that failed is not lost where this study has a run of that name: now its weights may be there. Neither is
+        one that the study has a run of in its place, where the table replaces such rows.
         """
         ours, names = {key for run in self.runs for key in _keys(run)}, {run.id for run in self.runs}
         gone = [rows for key, rows in self._before.items() if key not in ours and not self._is_stored(key[-1])]
         lost = {
             f"{row.setting}/{row.variant}/seed_{row.training_seed}": row.error_kind for rows in gone for row in rows
         }
-        return [name for name, failed in lost.items() if not (failed and name in names)]
+        return [name for name, failed in lost.items() if not ((failed or self.replaces) and name in names)]
 
     def _is_stored(self, name: str | None) -> bool:
         return bool(name and self.store.spec(Run.kind, name))
@@ -116,14 +122,21 @@ class Table:
         for run in self.runs:
             if self._is_filmed(run):
                 self._copy_video(run)
-        write_rows([row for run in self.runs for row in self._rows(run)], self.root / ROWS)
+        anew = {run.arm.id for run in self.runs if self.made(run)}
+        write_rows([row for run in self.runs for row in self._rows(run, run.arm.id in anew)], self.root / ROWS)
 
-    def _rows(self, run: Run) -> list[Row]:
-        """The rows of a run; of one that is to be made, a row that says so, or why it failed before."""
+    def _rows(self, run: Run, is_begun: bool) -> list[Row]:
+        """The rows of a run; of one that is to be made, a row that says so, why it failed before, or what it replaces.
+
+        Args:
+            is_begun: whether some run of its setting and variant has been made.
+        """
         if rows := self.made(run):
             return rows
         if failed := self._rows_before(run, failed=True):
             return [replace(row, **_names(run)) for row in failed]
+        if self.replaces and not is_begun and (older := self._outdated(run)):
+            return older
         seeds = {"training_seed": run.seed, "evaluation_seed": run.arm.starts.start}
         return [Row(run=run.digest, **seeds, episode=0, error_kind=NOT_RUN, **_names(run))]
 

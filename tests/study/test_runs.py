@@ -485,6 +485,29 @@ def test_no_row_is_lost_that_is_nowhere_else(tmp_path):
     assert set(read_rows(tmp_path / "x" / "rows.parquet")["variant"]) == {"a", "no_op", "replay"}
 
 
+def test_rows_of_other_code_are_replaced_an_arm_at_a_time(tmp_path):
+    table = make_all(study(), tmp_path)
+    published = tmp_path / "x" / ROWS
+    older = [replace(row, run=None, final_error_m=0.5) for row in load_rows(published)]
+    write_rows(older, published)
+    mine = Store(tmp_path / "mine")
+    with pytest.raises(InputError, match="would be lost. Give another --root, or --replace=true"):
+        run_study(study(), "", tmp_path / "x", mine, Options(only="fixed/a/seed_1"))
+    again = Table(tmp_path / "x", table.runs, mine, replaces=True)
+    assert again.missing() == table.runs and not again.lost()
+    again.write()
+    assert load_rows(published) == older, "until something is made, they stand"
+    run = next(run for run in table.runs if run.id == "fixed/a/seed_1")
+    shutil.copytree(table.store.folder(run), mine.folder(run))
+    Table(tmp_path / "x", table.runs, mine, replaces=True).write()
+    left = {(row.variant, row.training_seed): row for row in load_rows(published)}
+    assert left["a", 1].run == run.digest and {left["a", seed].error_kind for seed in (0, 2)} == {NOT_RUN}
+    others = [row for row in left.values() if row.variant != "a"]
+    assert others == [row for row in older if row.variant != "a"]
+    fewer = study(variants={"a": study().variants["a"]})
+    assert Table(tmp_path / "x", list_runs(fewer), mine, replaces=True).lost() == ["fixed/b/seed_0", "fixed/b/seed_1"]
+
+
 def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_path):
     table = make_all(study(), tmp_path)
     published = read_rows(tmp_path / "x" / "rows.parquet")

@@ -1,0 +1,246 @@
+"""Makes the published results, a piece of a study at a time: `make results`.
+
+A piece is a setting of a study, or one draw of it. Its rows, times, report and the numbers in pages are committed
+before the next one begins, so that a killed run, or a clone on another machine, makes only what is left.
+
+    python results/make.py --status            # what is left, and how long it takes as far as that is known
+    python results/make.py --only=precise      # the pieces whose names fit, or begin so
+    python results/make.py --minutes=120       # begin no piece after so long
+    python results/make.py --executor=ray      # the runs of a piece on a cluster
+    python results/make.py --discard           # remove demonstrations and features that no piece needs any more
+"""
+
+import subprocess
+import time
+from argparse import RawDescriptionHelpFormatter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import groupby
+from pathlib import Path
+
+from render import PAGES, render
+
+from lerobot_constructskill.artifacts.folders import write_text
+from lerobot_constructskill.artifacts.store import Node, Store
+from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.lerobot_internals import load_plugins
+from lerobot_constructskill.parsing import parse
+from lerobot_constructskill.presets import find
+from lerobot_constructskill.scripts.console import Parser, edge, say
+from lerobot_constructskill.scripts.report import ReportConfig, report
+from lerobot_constructskill.scripts.study import StudyConfig, text_of
+from lerobot_constructskill.study.plan import list_runs
+from lerobot_constructskill.study.rows import Draws
+from lerobot_constructskill.study.runs import Run
+from lerobot_constructskill.study.session import run_study
+from lerobot_constructskill.study.spec import Options, Study
+from lerobot_constructskill.study.status import tell_time
+from lerobot_constructskill.study.table import Table
+from lerobot_constructskill.study.timing import seconds_per_run
+
+ROOT = Path(__file__).parents[1]
+
+STUDIES = (
+    "paper",
+    "representation",
+    "precise",
+    "draws",
+    "base_camera",
+    "dart_dagger",
+    "perturbed",
+    "orders",
+    "walls",
+    "other_policies",
+)
+"""What the benchmark stands on, in the order in which it is made."""
+
+SOURCES = ("lerobot_constructskill", "configs")
+"""Folders whose uncommitted edits would be in rows, and in no commit that makes these rows again."""
+
+OURS = "frozen_vit"
+"""The policy type whose seeds train together. One of another type takes long, and is a piece by itself."""
+
+BULKY = ("demonstrations", "features", "rounds", "dagger")
+"""Kinds of nodes that can be removed once their runs are made: the features of a draw take 12 GB."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What is made and committed at once.
+
+    Args:
+        study: name of a shipped study.
+        name: of the piece: study/setting, and what else tells it from the others of that setting.
+        runs: its runs, made or not.
+    """
+
+    study: str
+    name: str
+    runs: Sequence[Run]
+
+    @property
+    def only(self) -> str:
+        return ",".join(run.id for run in self.runs)
+
+
+def pieces_of(name: str, study: Study) -> Iterator[Piece]:
+    """The pieces of a study, in its order."""
+    draws = Draws(study.demonstrations, study.starts, study.seeds_a_draw)
+    is_many = any(draws.of(seed) for of in study.variants.values() for seed in of.training_seeds)
+
+    def title(run: Run) -> str:
+        parts = [name, run.arm.setting]
+        if run.arm.learner and run.arm.learner.config.type != OURS:
+            parts.append(run.arm.name)
+        return "/".join([*parts, f"draw_{draws.of(run.seed)}"] if is_many else parts)
+
+    runs = list_runs(study)
+    order = {one: number for number, one in enumerate(dict.fromkeys(map(title, runs)))}
+    for one, own in groupby(sorted(runs, key=lambda run: order[title(run)]), key=title):
+        yield Piece(name, one, list(own))
+
+
+class Maker:
+    """Makes pieces of studies in a checkout.
+
+    Args:
+        root: the checkout, whose folder results/ is written and committed.
+        store: where runs are made.
+        options: how; `only` is each piece's own.
+    """
+
+    def __init__(self, root: Path, store: Path, studies: Sequence[str] = STUDIES, **options):
+        self.root, self.store, self.options = root, Store(store.absolute()), options
+        self.configs = {name: parse(StudyConfig, [], find("study", name)) for name in studies}
+
+    def folder(self, study: str) -> Path:
+        return self.root / "results" / study
+
+    def pieces(self, only: str = "") -> list[Piece]:
+        """All pieces, or those whose names fit a pattern or begin with it.
+
+        Raises:
+            InputError: no piece does.
+        """
+        every = [piece for name, config in self.configs.items() for piece in pieces_of(name, config.study)]
+        chosen = [
+            one for one in every if not only or fnmatchcase(one.name, only) or f"{one.name}/".startswith(f"{only}/")
+        ]
+        if not chosen:
+            raise InputError(f"--only={only} fits no piece; the first one is {every[0].name}.")
+        return chosen
+
+    def missing(self, piece: Piece) -> list[Run]:
+        """The runs of a piece that are to be made."""
+        table = Table(self.folder(piece.study), piece.runs, self.store, replaces=True)
+        return table.missing()
+
+    def status(self, pieces: Sequence[Piece]) -> str:
+        """A line for each piece that is to be made, and their number."""
+        due = [(piece, runs) for piece in pieces if (runs := self.missing(piece))]
+        lines = [f"{piece.name}: {plural(len(runs), 'run')}, {self.time(piece, runs)}" for piece, runs in due]
+        return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made"])
+
+    def time(self, piece: Piece, runs: Sequence[Run]) -> str:
+        """How long runs take, by those of their study that were made: of the same variant, else by the mean."""
+        took = seconds_per_run(self.folder(piece.study))
+        mean = {run.arm.id: sum(took.values()) / len(took) for run in runs} if took else {}
+        return tell_time(runs, mean | took)
+
+    def make(self, piece: Piece) -> None:
+        """Make what is missing of a piece, write its pages and commit them.
+
+        Raises:
+            InputError: the sources have edits that are in no commit.
+        """
+        self._check_sources()
+        config, folder = self.configs[piece.study], self.folder(piece.study)
+        folder.mkdir(parents=True, exist_ok=True)
+        options = Options(only=piece.only, replace=True, **self.options)
+        run_study(config.study, text_of(config), folder, self.store, options)
+        self.publish(piece)
+
+    def discard(self, piece: Piece) -> None:
+        """Remove the demonstrations and features of a piece that is made, unless another one will need them."""
+        left = [run for other in self.pieces() for run in self.missing(other)]
+        for node in _bulky(piece.runs) - _bulky(left):
+            with self.store.claim([node]):
+                self.store.discard(node)
+
+    def publish(self, piece: Piece) -> None:
+        """Write the report of a piece's study and the numbers in pages, and commit them with its rows."""
+        report(ReportConfig(self.folder(piece.study)))
+        for page in self._pages:
+            write_text(page, render(page))
+        _remove_unseen(self.folder(piece.study) / "figures", self._pages)
+        paths = ["--", "results", *self._pages]
+        self._git("add", *paths)
+        if self._git("diff", "--cached", "--name-only", *paths):
+            self._git("commit", "--quiet", f"--message=Results: {piece.name}", *paths)
+
+    @property
+    def _pages(self) -> list[Path]:
+        return [self.root / page.relative_to(ROOT) for page in PAGES]
+
+    def _check_sources(self) -> None:
+        if edited := self._git("status", "--porcelain", "--", *SOURCES).splitlines():
+            raise InputError(f"Commit your edits first, so that a commit makes the rows again: {edited[0][3:]}")
+
+    def _git(self, *arguments) -> str:
+        command = ["git", "-C", self.root, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def _bulky(nodes: Sequence[Node]) -> set[Node]:
+    """What some nodes are made of, and can be removed."""
+    found: set[Node] = set()
+    for node in nodes:
+        own = node.inputs.values()
+        found |= {one for one in own if one.kind in BULKY} | _bulky([*own])
+    return found
+
+
+def _remove_unseen(figures: Path, pages: Sequence[Path]) -> None:
+    """Remove the figures of a study that neither its report nor a page shows."""
+    report_text = (figures.parent / "report.md").read_text(encoding="utf-8")
+    seen = report_text + "".join(page.read_text(encoding="utf-8") for page in pages)
+    for figure in figures.glob("*.png"):
+        if f"figures/{figure.name})" not in seen:
+            figure.unlink()
+
+
+def main() -> None:
+    """Make what is left, as the command line says."""
+    parser = Parser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="pieces whose names fit this pattern, or begin so")
+    parser.add_argument("--status", action="store_true", help="make nothing, say what is left")
+    parser.add_argument("--minutes", type=float, help="begin no piece after so many")
+    parser.add_argument("--store", type=Path, default=ROOT / "outputs" / "store", help="where runs are made")
+    parser.add_argument(
+        "--discard", action="store_true", help="remove demonstrations and features when they are used up"
+    )
+    parser.add_argument("--executor", default="processes", help="processes or ray")
+    parser.add_argument("--workers", type=int, default=2, help="processes that generate demonstrations")
+    asked = parser.parse_args()
+    load_plugins()
+    maker = Maker(ROOT, asked.store, executor=asked.executor, workers=asked.workers)
+    pieces, start = maker.pieces(asked.only), time.monotonic()
+    if asked.status:
+        say(maker.status(pieces))
+        return
+    for piece in pieces:
+        if runs := maker.missing(piece):
+            if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
+                say(f"Stopped before {piece.name}; the same command continues there")
+                return
+            say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.time(piece, runs)}")
+            maker.make(piece)
+            if asked.discard:
+                maker.discard(piece)
+    say("All is made")
+
+
+if __name__ == "__main__":
+    with edge():
+        main()

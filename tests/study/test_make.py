@@ -1,0 +1,151 @@
+"""`make results`: pieces are made once, committed one by one, and go on in another checkout."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.study import session
+from lerobot_constructskill.study.rows import ROWS, EpisodeRow, load_rows, write_rows
+from lerobot_constructskill.study.runs import EPISODES
+
+ROOT = Path(__file__).parents[2]
+
+STUDY = {
+    "settings": {
+        name: {"data": "smoke", "env": {"episode_length": length, "obs_type": "pixels_agent_pos"}}
+        for name, length in (("one", 8), ("two", 9))
+    },
+    "variants": {
+        "a": {"policy": {"type": "frozen_vit", "backbone": "dinov2_vits14"}, "seeds": 2},
+        "act": {"policy": {"type": "act", "pretrained_backbone_weights": None}, "seeds": 1, "settings": ["one"]},
+    },
+    "references": {"no_op": 1},
+    "episodes": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def made():
+    """The module, as the script finds it."""
+    sys.path.insert(0, str(ROOT / "results"))
+    try:
+        import make
+
+        yield make
+    finally:
+        sys.path.remove(str(ROOT / "results"))
+
+
+def git(root, *arguments):
+    who = ["-c", "user.name=anyone", "-c", "user.email=anyone@localhost"]
+    command = ["git", *who, "-C", str(root), *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch, made):
+    """A repository with a study and a page that shows a number of it; runs are made at once, without a simulator."""
+    root = tmp_path / "checkout"
+    for name in ("results/tiny", "configs", "lerobot_constructskill"):
+        (root / name).mkdir(parents=True)
+    (root / "configs" / "tiny.yaml").write_text(yaml.safe_dump({"name": "tiny"} | STUDY))
+    (root / "README.md").write_text("No number yet.\n")
+    for name in ("user.name", "user.email"):
+        monkeypatch.setenv(f"GIT_CONFIG_KEY_{name == 'user.email':d}", name)
+        monkeypatch.setenv(f"GIT_CONFIG_VALUE_{name == 'user.email':d}", "anyone@localhost")
+    monkeypatch.setenv("GIT_CONFIG_COUNT", "2")
+    git(root, "init", "--quiet")
+    git(root, "add", ".")
+    git(root, "commit", "--quiet", "--message=what there is")
+    monkeypatch.setattr(made, "PAGES", [ROOT / "README.md"])
+    monkeypatch.setattr(made, "find", lambda kind, name: root / "configs" / f"{name}.yaml")
+    monkeypatch.setattr(session, "make_runs", make_at_once)
+    monkeypatch.setattr(session, "validate", lambda *_: None)
+    return root
+
+
+def make_at_once(job):
+    for run in job.runs:
+        with job.store.claim([run]) as missing:
+            for node in missing:
+                with job.store.writing(node) as folder:
+                    folder.mkdir()
+                    row = EpisodeRow(
+                        run=run.digest, training_seed=run.seed, evaluation_seed=1000, episode=0, versions="{}"
+                    )
+                    rows = [replace(row, episode=number, placed=True, lifted=True) for number in range(2)]
+                    write_rows(rows, folder / EPISODES, EpisodeRow)
+        yield run
+
+
+def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkout, tmp_path, made):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    pieces = {piece.name: len(piece.runs) for piece in maker.pieces()}
+    assert pieces == {"tiny/one": 3, "tiny/one/act": 1, "tiny/two": 3}, "another policy type is a piece of its own"
+    (first,) = maker.pieces("tiny/two")
+    maker.make(first)
+    assert git(checkout, "log", "--format=%s").splitlines() == ["Results: tiny/two", "what there is"]
+    assert not git(checkout, "status", "--porcelain", "--", "results", "README.md")
+    assert maker.status(maker.pieces()).splitlines() == [
+        "tiny/one: 3 runs, time unknown",
+        "tiny/one/act: 1 run, time unknown",
+        "1 of 3 pieces made",
+    ]
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
+    elsewhere = made.Maker(clone, tmp_path / "another_store", ["tiny"])
+    assert [piece.name for piece in elsewhere.pieces() if elsewhere.missing(piece)] == ["tiny/one", "tiny/one/act"]
+    for piece in elsewhere.pieces():
+        if elsewhere.missing(piece):
+            elsewhere.make(piece)
+    for piece in maker.pieces():
+        if maker.missing(piece):
+            maker.make(piece)
+    assert load_rows(clone / "results/tiny" / ROWS) == load_rows(checkout / "results/tiny" / ROWS)
+    assert (clone / "results/tiny/report.md").read_text() == (checkout / "results/tiny/report.md").read_text()
+    assert elsewhere.status(elsewhere.pieces()) == "3 of 3 pieces made"
+
+
+def test_the_numbers_of_a_page_are_committed_with_their_rows(checkout, tmp_path, made):
+    link = '(results/tiny/report.md "placed two/a")'
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    (piece,) = maker.pieces("tiny/two")
+    maker.make(piece)
+    (checkout / "README.md").write_text(f"It places [a lot]{link}.\n")
+    maker.publish(piece)
+    assert git(checkout, "show", "HEAD:README.md") == f"It places [4/4]{link}.\n"
+
+
+def test_nothing_is_made_of_sources_that_are_in_no_commit(checkout, tmp_path, made):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    (checkout / "configs" / "tiny.yaml").write_text("name: other\n")
+    with pytest.raises(InputError, match=r"Commit your edits first.*: configs/tiny.yaml"):
+        maker.make(maker.pieces()[0])
+    with pytest.raises(InputError, match="--only=huge fits no piece; the first one is tiny/one"):
+        maker.pieces("huge")
+
+
+def test_what_no_piece_needs_any_more_can_be_removed(checkout, tmp_path, made):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    one, act, two = maker.pieces()
+    kinds = sorted({node.kind for node in made._bulky(one.runs)})
+    assert kinds == ["demonstrations", "features"]
+    nodes = made._bulky(one.runs)
+    for node in nodes:
+        with maker.store.writing(node) as folder:
+            folder.mkdir()
+    for piece, left in ((one, nodes), (act, nodes), (two, set())):
+        maker.make(piece)
+        maker.discard(piece)
+        assert {node for node in nodes if maker.store.has(node)} == left, piece.name
+
+
+def test_every_study_that_the_benchmark_stands_on_has_a_folder_and_no_other_has(made):
+    folders = {path.parent.name for path in (ROOT / "results").glob("*/study.yaml")}
+    assert folders == {*made.STUDIES} and len(made.STUDIES) <= 10
