@@ -87,7 +87,7 @@ def test_a_study_with_a_damaged_file_is_refused_at_every_door(door, file, tmp_pa
     root = tmp_path / "study"
     root.mkdir()
     for name in ("study.yaml", "rows.parquet"):
-        shutil.copy(RESULTS / "heat_maps" / name, root)
+        shutil.copy(RESULTS / "base_camera" / name, root)
     whole = (root / file).read_bytes()
     read_rows(root / "rows.parquet")  # Arrow starts its threads, whose stacks are no file's doing
     for way, damage in (hostile.WAYS | {"truncated": hostile.truncate}).items():

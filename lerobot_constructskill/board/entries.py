@@ -14,12 +14,33 @@ from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS, PublicValue
 from lerobot_constructskill.board.recovered import Recovery, path_of, read_recovered
 from lerobot_constructskill.board.rerun import check_later
-from lerobot_constructskill.board.submission import Claim, Submission, read_submission
+from lerobot_constructskill.board.submission import SCORES, Claim, Submission, read_submission
 from lerobot_constructskill.board.verification import different, read_verification
+from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.plans.plan import read_plan
 
 ENTRIES, VERIFIED = "entries", "verified"
 """Folders of a board: what anybody submits, and what its keepers found when they verified it."""
+
+
+@dataclass(frozen=True)
+class Laid:
+    """What an entry laid of a plan. Means are over training seeds, then over a seed's episodes, failed ones included.
+
+    Args:
+        elements: of the plan.
+        chain: elements that lie in their places before the first that does not: mean, least and most of a seed.
+        share: of the elements that lie in their places at the end, in [0, 1]: the same.
+        drops, knocks, collisions: how often in all episodes, as of `recording.Episode`.
+    """
+
+    elements: int
+    chain: Estimate
+    share: Estimate
+    drops: int
+    knocks: int
+    collisions: int
 
 
 @dataclass(frozen=True)
@@ -30,12 +51,14 @@ class Standing:
         claims: its episodes there, by training seed.
         placed, lifted: mean over training seeds of the share of episodes, with its interval over seeds.
         errors: episodes that failed with an error; they count as neither.
+        laid: what it laid; None where the task is no plan, or the entry is from before this was counted.
     """
 
     claims: dict[int, list[Claim]]
     placed: Estimate
     lifted: Estimate
     errors: int
+    laid: Laid | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +121,24 @@ class Entry:
             mean_rate(np.array([np.mean([getattr(one, of) for one in own]) for own in claims.values()]))
             for of in ("placed", "lifted")
         )
-        return Standing(claims, placed, lifted, errors=sum(one.error is not None for one in there))
+        errors = sum(one.error is not None for one in there)
+        plan = get_task(self.declaration.settings[setting].task).plan
+        laid = _laid(claims, len(read_plan(plan).elements)) if plan else None
+        return Standing(claims, placed, lifted, errors, laid)
+
+
+def _laid(claims: dict[int, list[Claim]], elements: int) -> Laid | None:
+    """What the episodes of each seed laid of a plan of so many elements; None where one does not tell."""
+    every = [claim for own in claims.values() for claim in own]
+    if any(claim.error is None and getattr(claim, name) is None for claim in every for name in SCORES):
+        return None
+
+    def over_seeds(score: str, of: int) -> Estimate:
+        means = [np.mean([(getattr(claim, score) or 0) / of for claim in own]) for own in claims.values()]
+        return Estimate(float(np.mean(means)), float(min(means)), float(max(means)))
+
+    counts = {name: sum(getattr(claim, name) or 0 for claim in every) for name in ("drops", "knocks", "collisions")}
+    return Laid(elements, over_seeds("chain", 1), over_seeds("placements", elements), **counts)
 
 
 def read_entries(root: Path) -> tuple[list[Entry], list[str]]:

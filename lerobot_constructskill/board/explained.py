@@ -5,7 +5,9 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from lerobot_constructskill.analysis.report.formats import percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate
+from lerobot_constructskill.board.entries import Laid
 from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.perturbations import AXES, Perturbation
@@ -26,6 +28,13 @@ MEANINGS = {
     "brick_on_brick": "A brick on top of another one, flush within 5 mm and 3 degrees.",
     "tile_to_grid": "A ceiling tile, held by a lifter, into an opening of the grid with 5 mm of clearance.",
     "tenon_to_mortise": "A timber post, its tenon into the mortise of a sill with 4 mm of play.",
+    "brick_to_grey": "Told so, the brick into the grey bin; a block and a blue bin are there too.",
+    "brick_to_blue": "The same scene; told so, the brick into the blue bin.",
+    "block_to_grey": "The same scene; told so, the block into the grey bin.",
+    "block_to_blue": "The same scene; told so, the block into the blue bin.",
+    "course_of_three": "Three bricks end to end, with joints of 10 mm.",
+    "bond_of_five": "Three bricks end to end, and two on them that bridge the joints.",
+    "lintel_on_posts": "A beam onto two posts that the robot sets first, level.",
 }
 """Of each task on the board."""
 
@@ -57,3 +66,11 @@ def drawn(estimate: Estimate, has_interval: bool) -> Markup:
         '<svg class="interval" viewBox="-3 0 106 8" aria-hidden="true"><path class="axis" d="M0 4H100M0 2V6M100 2V6"/>'
         f'{bar}<circle cx="{value:.1f}" cy="4" r="3"/></svg>'
     )
+
+
+def laid(of: Laid) -> str:
+    """What was laid of a plan, in a line."""
+    low, high = of.chain.low, of.chain.high
+    counts = [f"{count} {name}" for name in ("drops", "knocks", "collisions") if (count := getattr(of, name))]
+    told = f"chain {of.chain.value:.2f} of {of.elements} ({low:.2f} to {high:.2f}), {percent(of.share.value)} in place"
+    return ", ".join([told, *counts])

@@ -27,7 +27,8 @@ RANKED_FROM = len(TRAINING_SEEDS)
 the rank: three that never place cannot be told from ten that always do."""
 
 HORIZON = 300
-"""Steps of an episode, 15 s. The slowest expert needs 191 (`brick_to_bin_turned`), the others about 100 to 175."""
+"""Steps of an episode, 15 s, where one object is placed; the slowest expert needs 191 (`brick_to_bin_turned`). A plan
+has as many as its task."""
 
 FIXED = ("brick_to_bin",)
 """Tasks with one initial state: one episode, as all others would repeat it."""
@@ -142,7 +143,12 @@ class Suite:
 
 
 def _settings(tasks: tuple[str, ...]) -> dict[str, BoardSetting]:
-    return {task: BoardSetting(task, episodes=1 if task in FIXED else STARTS) for task in tasks}
+    return {task: BoardSetting(task, 1 if task in FIXED else STARTS, _steps(task)) for task in tasks}
+
+
+def _steps(task: str) -> int:
+    found = get_task(task)
+    return found.horizon if found.plan else HORIZON
 
 
 _PERTURBED = {CONTROL: BoardSetting(PERTURBED_TASK)} | {
@@ -153,6 +159,8 @@ BOARD_SUITES = {
     "bins": Suite("Bins: put it in", _settings(SUITES["bins"])),
     "ladder": Suite("Ladder: less and less clearance", _settings(SUITES["ladder"])),
     "joints": Suite("Joints: set it flush", _settings(SUITES["joints"])),
+    "orders": Suite("Orders: do what is said", _settings(SUITES["orders"])),
+    "wall": Suite("Wall: lay one after another", _settings(SUITES["wall"])),
     "perturbed": Suite("Perturbed: one thing changed at a time", _PERTURBED),
 }
 """Every suite of the board, by name."""

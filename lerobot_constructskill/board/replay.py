@@ -9,7 +9,7 @@ from typing import Any
 
 from lerobot_constructskill.artifacts.pools import Submit, cores, open_pool
 from lerobot_constructskill.board.protocol import PHYSICS
-from lerobot_constructskill.board.submission import Claim, Submission
+from lerobot_constructskill.board.submission import SCORES, Claim, Submission
 from lerobot_constructskill.board.verification import different
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER, Episode, deciding
@@ -134,6 +134,7 @@ def difference(env: ConstructSkillEnv, claim: Claim, see: Callable[[], None] = l
         see()
     if not is_over:
         return f"{claim.label}: its actions end after {episode.steps} steps, and its episode goes on"
-    said = claim.outcome
-    told = [f"{name} is {came}, not {said[name]}" for name, came in episode.outcome.items() if came != said[name]]
+    said = claim.outcome | {name: score for name in SCORES if (score := getattr(claim, name)) is not None}
+    came = {name: getattr(episode, name) for name in said}
+    told = [f"{name} is {came[name]}, not {value}" for name, value in said.items() if came[name] != value]
     return f"{claim.label}: {', '.join(told)}" if told else None

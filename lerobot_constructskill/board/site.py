@@ -10,14 +10,14 @@ from markupsafe import Markup
 from lerobot_constructskill.analysis.report.formats import p_value, percent, share_range, whole
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
-from lerobot_constructskill.board.explained import drawn, meaning, picture
+from lerobot_constructskill.board.explained import drawn, laid, meaning, picture
 from lerobot_constructskill.board.exports import TABLE, write_exports
 from lerobot_constructskill.board.films import films_there, write_films
 from lerobot_constructskill.board.losses import by_seed, by_setting, checked, depends_on_seed
 from lerobot_constructskill.board.protocol import BOARD_SUITES, CLASSES, LEVELS, RANKED_FROM
 from lerobot_constructskill.board.recovered import MEANING, PATIENCE, STRIDES
 from lerobot_constructskill.board.rerun import describe
-from lerobot_constructskill.contract import STAGES
+from lerobot_constructskill.contract import STAGES, SUITES
 from lerobot_constructskill.errors import InputError, plural
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -84,6 +84,7 @@ def _suite_page(name: str, entries: list[Entry], out: Path, common: dict[str, An
         strides=STRIDES,
         films=lambda entry, column: films_there(entry, column, out),
         table=TABLE,
+        plans=SUITES["wall"],
         **common,
     )
 
@@ -122,5 +123,5 @@ def _render(template: str, **context) -> str:
     environment.filters |= {"percent": percent, "share_range": share_range, "plural": plural, "grid": grid}
     environment.filters |= {"by_setting": by_setting, "by_seed": by_seed, "checked": checked, "p_value": p_value}
     environment.filters |= {"depends_on_seed": depends_on_seed, "number": whole, "rates": describe}
-    environment.filters |= {"meaning": meaning, "picture": picture, "drawn": drawn}
+    environment.filters |= {"meaning": meaning, "picture": picture, "drawn": drawn, "laid": laid}
     return environment.get_template(template).render(**context)

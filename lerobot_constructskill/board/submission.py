@@ -22,7 +22,7 @@ from lerobot_constructskill.artifacts.revisions import PREFIX
 from lerobot_constructskill.artifacts.tables import Parquet
 from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.declaration import DECLARED, LINE, Declaration, Trained
-from lerobot_constructskill.contract import STAGES, get_task
+from lerobot_constructskill.contract import MAX_PLACEMENTS, STAGES, get_task
 from lerobot_constructskill.envs.recording import ACTIONS, DECIDING, OUTCOME, Episode, to_rows, write_recordings
 from lerobot_constructskill.errors import DISTRIBUTION, InputError, MissingError, plural
 from lerobot_constructskill.files import bounded_memory, read_bytes, read_parquet, to_text
@@ -60,8 +60,12 @@ class Claim(Episode):
         return f"{self.setting}, training seed {self.training_seed}, start {self.evaluation_seed}"
 
 
-COLUMNS = ("evaluation_seed", *OUTCOME, "setting", "training_seed", "error", "actions")
-NULLABLE = ("lift_step", "place_step", "error")
+SCORES = ("placements", "chain", "drops", "knocks", "collisions")
+"""Counts of an episode that executing its actions again must reproduce, where they are told: older files lack them."""
+
+OLDER = ("evaluation_seed", *OUTCOME, "setting", "training_seed", "error", "actions")
+COLUMNS = (*OLDER[:-1], *SCORES, OLDER[-1])
+NULLABLE = ("lift_step", "place_step", "error", *SCORES)
 TYPES = Parquet("a submission's episodes", Claim, ACTIONS).schema
 SCHEMA = pa.schema([TYPES.field(name).with_nullable(name in NULLABLE) for name in COLUMNS])
 """Of episodes.parquet. What else an episode has is declared."""
@@ -168,7 +172,7 @@ def _read_claims(path: Path, declaration: Declaration) -> list[Claim]:
             table = read_parquet(path, most=declaration.most_bytes + SLACK)
     except MemoryError:
         raise InputError(f"{EPISODES_FILE} unpacks to more than its episodes can hold.") from None
-    if not table.schema.remove_metadata().equals(SCHEMA):
+    if table.schema.remove_metadata() not in (SCHEMA, pa.schema([SCHEMA.field(name) for name in OLDER])):
         raise InputError(f"{EPISODES_FILE} does not have the columns of a submission.")
     if table.num_rows != declaration.episodes:
         raise InputError(
@@ -201,7 +205,8 @@ def _check(claim: Claim) -> None:
 
 
 def _rules_of_failed(claim: Claim) -> list[tuple[bool, str]]:
-    is_empty = claim.outcome == Episode(claim.evaluation_seed).outcome and not len(claim.flat)
+    names = (*OUTCOME, *SCORES)
+    is_empty = _values(claim, names) == _values(Episode(claim.evaluation_seed), names) and not len(claim.flat)
     return [
         (LINE.allows(claim.error), f"error must be {LINE.meaning}"),
         (is_empty, "an episode with an error has neither outcome nor actions"),
@@ -220,6 +225,14 @@ def _rules(claim: Claim) -> list[tuple[bool, str]]:
             claim.placed == (stage == "placed") and claim.lifted >= (stage == "lifted"),
             f"stage {stage} is not what lifted and placed say",
         ),
+        (
+            all(value is None or value >= 0 for value in _values(claim, SCORES)),
+            f"{', '.join(SCORES)} must be 0 or more",
+        ),
+        (
+            (claim.chain or 0) <= (claim.placements or 0) <= MAX_PLACEMENTS,
+            f"chain must be at most placements, and these at most {MAX_PLACEMENTS}",
+        ),
         *_rules_of_step("lift", claim.lifted, claim.lift_step, steps),
         *_rules_of_step("place", claim.placed, claim.place_step, steps),
         (
@@ -227,6 +240,10 @@ def _rules(claim: Claim) -> list[tuple[bool, str]]:
             f"the placement ends an episode, so place_step must be {steps}",
         ),
     ]
+
+
+def _values(episode: Episode, names: Iterable[str]) -> list[Any]:
+    return [getattr(episode, name) for name in names]
 
 
 def _rules_of_step(name: str, happened: bool, step: int | None, steps: int) -> list[tuple[bool, str]]:

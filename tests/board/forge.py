@@ -221,6 +221,18 @@ def a_success_beside_an_error(root, rng):
 
 
 @forges(READ)
+def counts_that_cannot_be(root, rng):
+    counts = [{"chain": 2, "placements": 1}, {"chain": 1}, {"knocks": -1}, {"placements": 10}, {"drops": -(2**60)}]
+    edit(root, lambda rows: rng.choice(rows).update(rng.choice(counts)))
+
+
+@forges(READ)
+def a_count_beside_an_error(root, rng):
+    empty = {"lifted": False, "placed": False, "stage": "none", "lift_step": None, "place_step": None, "steps": 0}
+    edit(root, lambda rows: rng.choice(rows).update(empty, error="out of memory", actions=[], knocks=0))
+
+
+@forges(READ)
 def a_truncated_file(root, rng):
     content = (root / EPISODES_FILE).read_bytes()
     (root / EPISODES_FILE).write_bytes(content[: int(rng.integers(len(content)))])
@@ -414,6 +426,13 @@ def weights_of_too_few_seeds(root, rng):
 
 
 # Refused when replayed
+
+
+@forges(REPLAYED)
+def other_counts(root, rng):
+    """It dropped nothing, knocked nothing over, and laid more."""
+    counts = [{"chain": 3, "placements": 3}, {"drops": 7}, {"knocks": 1}, {"collisions": 1000}]
+    edit(root, lambda rows: rng.choice([row for row in rows if not row["placed"]]).update(rng.choice(counts)))
 
 
 @forges(REPLAYED)
