@@ -24,7 +24,12 @@ from lerobot_constructskill.study.rows import ROWS, read_draws, read_rows
 
 ROOT = Path(__file__).parents[1]
 
-PAGES = [ROOT / "README.md", ROOT / "docs" / "results.md", *sorted((ROOT / "results").glob("*/notes.md"))]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "docs" / "policies.md",
+    ROOT / "docs" / "results.md",
+    *sorted((ROOT / "results").glob("*/notes.md")),
+]
 
 LINK = re.compile(r'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>\w+) )?(?P<arm>\w+/\w+)"\)')
 
