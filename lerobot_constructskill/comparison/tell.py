@@ -61,8 +61,8 @@ def as_json(matched: MatchedSides | OverTasks) -> str:
     """Every number as JSON; an estimate is [value, low, high], and infinity, which JSON does not have, is null."""
     values = asdict(matched)
     for one in (values, *values.get("tasks", {}).values()):
-        if one["judgement"]["seeds_needed"] == inf:
-            one["judgement"]["seeds_needed"] = None
+        finite = {name: None for name, value in one["judgement"].items() if value == inf}
+        one["judgement"] |= finite
     return json.dumps(values, indent=2) + "\n"
 
 
@@ -125,6 +125,8 @@ def _power(judgement: Judgement, alpha: float) -> str:
         return "Seeds do not vary on either side, so how large a difference would be found cannot be told."
     found = "no difference, however large" if visible > 1 else f"a difference of {visible * 100:.0f} points"
     told = f"With this many seeds, {TARGET:.0%} of comparisons would find {found}, if seeds vary as these do."
+    ratio = judgement.visible_spread
+    told += f" Of spreads, they would find {'none' if ratio == inf else f'one that is {ratio:g} times the other'}."
     needed = judgement.seeds_needed
     if judgement.conclusion is Conclusion.INCONCLUSIVE and needed is not None:
         number = f"more than {MOST}" if needed == inf else f"about {needed}"

@@ -24,6 +24,7 @@ from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, mea
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
 from lerobot_constructskill.analysis.stats.power import (
     _rejected,
+    detectable_spread_ratio,
     power,
     seeds_needed,
     wrong_order,
@@ -223,6 +224,15 @@ def test_scipys_bootstrap_is_certain_of_ten_equal_seeds(method, rng):
     interval = bootstrap((np.ones(10),), np.mean, method=method, rng=rng).confidence_interval
     assert not interval.high - interval.low > 0
     assert mean_rate(np.ones(10)).low == pytest.approx(0.025 ** (1 / 10))
+
+
+def test_a_ratio_of_spreads_is_found_in_four_of_five_studies():
+    rng = np.random.default_rng(1)
+    ratio = detectable_spread_ratio(10, 10)
+    found = [spread_p_value(ratio * rng.normal(size=10), rng.normal(size=10)) < 0.05 for _ in range(100)]
+    assert 2 < ratio < 5 and 0.7 < np.mean(found) < 0.98
+    assert detectable_spread_ratio(30, 30) < ratio < detectable_spread_ratio(5, 5)
+    assert detectable_spread_ratio(3, 3) == np.inf, "twenty orders of six seeds give no small p-value"
 
 
 def test_spread_test():

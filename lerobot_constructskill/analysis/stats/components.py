@@ -43,7 +43,7 @@ def split(episodes: pd.DataFrame) -> Components | None:
     """
     seeds = episodes.groupby("draw")["training_seed"].nunique()
     shared = episodes.groupby("evaluation_seed")["draw"].nunique().max() > 1 if len(episodes) else False
-    if len(seeds) < 2 or seeds.max() < 2 or shared or episodes["met"].nunique() < 2:
+    if len(seeds) < 2 or seeds.max() < 2 or shared or _is_told_by_one(episodes):
         return None
     told = episodes.astype({"draw": int, "training_seed": int, "evaluation_seed": int, "met": float})
     parts = {"seeds": "0 + C(training_seed)", "starts": "0 + C(evaluation_seed)"}
@@ -53,7 +53,7 @@ def split(episodes: pd.DataFrame) -> Components | None:
             warnings.simplefilter("ignore", of_a_component_at_0)  # which its interval says
         try:
             fit = model.fit(reml=True, method="powell")  # others stop short where a component is 0
-        except np.linalg.LinAlgError:  # nothing is left beside the components
+        except np.linalg.LinAlgError:
             return None
         found = _deviations(fit, model.exog_vc.names)
     if not np.isfinite([one.value for one in found.values()]).all():
@@ -61,6 +61,12 @@ def split(episodes: pd.DataFrame) -> Components | None:
     a_run = np.sqrt(episodes.groupby(["draw", "training_seed"])["evaluation_seed"].nunique().mean())
     starts = Estimate(*(float(value / a_run) for value in found["starts"]))
     return Components(found["draws"], found["seeds"], starts)
+
+
+def _is_told_by_one(episodes: pd.DataFrame) -> bool:
+    """Whether nothing is left beside one component: draw, seed or start alone says how each episode ended."""
+    parts = ("draw", "training_seed", "evaluation_seed")
+    return any(episodes.groupby(part)["met"].nunique().max() == 1 for part in parts)
 
 
 def _deviations(fit: MixedLMResults, parts: list[str]) -> dict[str, Estimate]:

@@ -15,7 +15,11 @@ from lerobot_constructskill.analysis.stats.comparisons import (
 )
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count
-from lerobot_constructskill.analysis.stats.power import detectable_mean_difference, seeds_needed_for_mean
+from lerobot_constructskill.analysis.stats.power import (
+    detectable_mean_difference,
+    detectable_spread_ratio,
+    seeds_needed_for_mean,
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Judgement:
         conclusion: from `p_value` and `difference`.
         visible: smallest difference of means that 80 % of comparisons with so many seeds find, if seeds vary as these
             do; None if they do not vary, or a side has one seed.
+        visible_spread: smallest ratio of the spreads that 80 % of comparisons with so many seeds find, if seeds vary
+            normally; infinite if they find none, None if a side has one seed.
         seeds_needed: seeds a side that find the observed difference with 80 % power; None if there is no difference
             or `visible` is None, infinite above `power.MOST`.
     """
@@ -51,6 +57,7 @@ class Judgement:
     spread_p_value: float
     conclusion: Conclusion
     visible: float | None
+    visible_spread: float | None
     seeds_needed: float | None
 
 
@@ -78,6 +85,7 @@ def judge(a: np.ndarray, b: np.ndarray, alpha: float = 0.05) -> Judgement:
         spread_p_value=spread_p_value(a, b),
         conclusion=conclude(p_value, apart, alpha),
         visible=detectable_mean_difference(deviation, len(a), len(b), alpha) if deviation else None,
+        visible_spread=detectable_spread_ratio(len(a), len(b), alpha) if min(len(a), len(b)) > 1 else None,
         seeds_needed=seeds_needed_for_mean(abs(apart.value), deviation, alpha) if deviation else None,
     )
 

@@ -14,6 +14,12 @@ TARGET = 0.8
 MOST = 150
 """Largest number of seeds an arm that is searched for."""
 
+RATIOS = (1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 8.0, 10.0)
+"""Of two standard deviations, that are tried in turn."""
+
+SIMULATED, SHUFFLED = 500, 400
+"""Studies that are simulated for each ratio, and orders of their seeds that are tried."""
+
 
 def wrong_order(rate_a: float, rate_b: float, seeds: int) -> float:
     """Chance that the worse of two variants with these true rates succeeds in more seeds, of `seeds` seeds each."""
@@ -69,6 +75,32 @@ def seeds_needed_for_mean(difference: float, deviation: float, alpha: float = 0.
     # `solve_power` for the number itself does not converge where the difference is large.
     enough = (n for n in range(2, MOST + 1) if detectable_mean_difference(deviation, n, n, alpha) <= difference)
     return next(enough, inf)
+
+
+@cache
+def detectable_spread_ratio(seeds_a: int, seeds_b: int, alpha: float = 0.05) -> float:
+    """The smallest of `RATIOS` of two standard deviations over seeds that is found with 80 % power, else infinity.
+
+    Simulated for seeds that vary normally about one mean, with the permutation test of `comparisons.spread_p_value`.
+
+    Args:
+        seeds_a, seeds_b: two or more each.
+    """
+    rng = np.random.default_rng(0)
+    seeds = rng.standard_normal((SIMULATED, seeds_a + seeds_b))
+    orders = rng.permuted(np.tile(np.arange(seeds_a + seeds_b), (SHUFFLED, 1)), axis=1)
+    for ratio in RATIOS:
+        arms = seeds * np.repeat([ratio, 1.0], [seeds_a, seeds_b])
+        seen = _apart(arms, seeds_a)
+        as_far = sum(_apart(arms[:, order], seeds_a) >= seen - 1e-12 for order in orders)
+        if np.mean((1 + as_far) / (1 + SHUFFLED) < alpha) >= TARGET:
+            return ratio
+    return inf
+
+
+def _apart(rates: np.ndarray, seeds_a: int) -> np.ndarray:
+    """Difference of the standard deviations of the first seeds and the others, (simulations,)."""
+    return np.abs(rates[:, :seeds_a].std(axis=1) - rates[:, seeds_a:].std(axis=1))
 
 
 def _joint(rate_a: float, rate_b: float, seeds: int) -> np.ndarray:
