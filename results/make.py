@@ -148,6 +148,10 @@ class Maker:
         mean = {run.arm.id: sum(took.values()) / len(took) for run in runs} if took else {}
         return tell_time(runs, mean | took)
 
+    def is_committed(self, piece: Piece) -> bool:
+        """Whether nothing of its study waits for a commit, as it does where a process was killed before that."""
+        return not self._git("status", "--porcelain", "--", self.folder(piece.study))
+
     def make(self, piece: Piece) -> None:
         """Make what is missing of a piece, write its pages and commit them.
 
@@ -174,7 +178,7 @@ class Maker:
         for page in self._pages:
             write_text(page, render(page))
         _remove_unseen(self.folder(piece.study) / "figures", self._pages)
-        paths = ["--", "results", *self._pages]
+        paths = ["--", self.folder(piece.study), *self._pages]
         self._git("add", *paths)
         if self._git("diff", "--cached", "--name-only", *paths):
             self._git("commit", "--quiet", f"--message=Results: {piece.name}", *paths)
@@ -238,6 +242,8 @@ def main() -> None:
             maker.make(piece)
             if asked.discard:
                 maker.discard(piece)
+        elif not maker.is_committed(piece):
+            maker.publish(piece)
     say("All is made")
 
 

@@ -20,7 +20,7 @@ import pandas as pd
 from lerobot_constructskill.analysis.report.formats import percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import by_draw, count, runs_of
-from lerobot_constructskill.study.rows import ROWS, read_draws, read_rows
+from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_rows
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,16 +37,22 @@ OFTEN = ["", "", " (two)", " (three)", " (four)", " (five)", " (six)", " (seven)
 
 
 class Arm:
-    """What the rows of a study say of one variant in one setting."""
+    """What the rows of a study say of one variant in one setting.
 
-    def __init__(self, folder: Path, name: str):
+    Raises:
+        SystemExit: the study has no such arm.
+    """
+
+    def __init__(self, rows: pd.DataFrame, draws: Draws, name: str):
         setting, variant = name.split("/")
-        rows = _rows(folder)
         self.rows = rows[(rows["setting"] == setting) & (rows["variant"] == variant)]
+        if self.rows.empty:
+            raise SystemExit(f"A page names {name}, which its study does not have.")
         self.runs = runs_of(self.rows)
-        if self.runs.empty:
-            raise SystemExit(f"{folder / ROWS} has no run of {name} that was made.")
-        self.draws = [read_draws(folder).of(seed) for seed in self.runs["training_seed"]]
+        self.draws = [draws.of(seed) for seed in self.runs["training_seed"]]
+
+    def tell(self, number: Callable[["Arm"], str]) -> str:
+        return "not run yet" if self.runs.empty else number(self)
 
     def met(self, criterion: str) -> str:
         return f"{self.runs[criterion].sum()}/{self.runs['episodes'].sum()}"
@@ -110,7 +116,7 @@ def render(page: Path) -> str:
     """A page with the numbers that the rows have now.
 
     Raises:
-        SystemExit: a link names an arm of which nothing was made.
+        SystemExit: a link names an arm that its study does not have.
     """
     return "".join(f"{text}\n" for text, _, _ in _lines(page))
 
@@ -129,33 +135,24 @@ def literals(page: Path) -> list[str]:
 def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Each line as rendered; if it is one of a table, the table's heads and its cells."""
     heads: list[str] = []
+    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder)))
+    arms = cache(lambda file, name: Arm(*study((page.parent / file).resolve().parent), name))
     for line in page.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
         heads = (heads or cells) if cells else []
         if cells and (row := next((one for one in LINK.finditer(line) if one["word"] is None), None)):
-            arm = _arm(_folder(page, row["file"]), row["arm"])
-            cells = [HEADS[head](arm) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)]
+            arm = arms(row["file"], row["arm"])
+            cells = [arm.tell(HEADS[head]) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)]
             line = f"| {' | '.join(cells)} |"
-        yield LINK.sub(lambda one: _linked(page, one), line), heads, cells
+        yield LINK.sub(lambda one: _linked(one, arms), line), heads, cells
 
 
-def _linked(page: Path, link: re.Match[str]) -> str:
+def _linked(link: re.Match[str], arms: Callable[[str, str], Arm]) -> str:
+    """A link with its number as its text; one of a row of a table as it is."""
     if link["word"] is None:
         return link[0]
-    text = WORDS[link["word"]](_arm(_folder(page, link["file"]), link["arm"]))
+    text = arms(link["file"], link["arm"]).tell(WORDS[link["word"]])
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
-
-
-def _folder(page: Path, file: str) -> Path:
-    return (page.parent / file).resolve().parent
-
-
-@cache
-def _rows(folder: Path) -> pd.DataFrame:
-    return read_rows(folder / ROWS)
-
-
-_arm = cache(Arm)
 
 
 def _range(estimate: Estimate) -> str:

@@ -93,7 +93,9 @@ def test_a_number_that_comes_from_no_rows_is_found(tmp_path):
 
 
 def test_an_arm_that_nobody_made_is_no_number(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(f'[]({ROOT}/results/orders/report.md "placed brick_to_grey/number")\n')
-    with pytest.raises(SystemExit, match=r"has no run of brick_to_grey/number that was made"):
+    page, orders = tmp_path / "page.md", f"{ROOT}/results/orders/report.md"
+    page.write_text(f'[]({orders} "placed brick_to_grey/number")\n')
+    assert render.render(page) == f'[not run yet]({orders} "placed brick_to_grey/number")\n'
+    page.write_text(f'[]({orders} "placed brick_to_grey/nothing")\n')
+    with pytest.raises(SystemExit, match=r"names brick_to_grey/nothing, which its study does not have"):
         render.render(page)

@@ -120,6 +120,30 @@ def test_the_numbers_of_a_page_are_committed_with_their_rows(checkout, tmp_path,
     (checkout / "README.md").write_text(f"It places [a lot]{link}.\n")
     maker.publish(piece)
     assert git(checkout, "show", "HEAD:README.md") == f"It places [4/4]{link}.\n"
+    (act,) = maker.pieces("tiny/one/act")
+    told = {word: f'(results/tiny/report.md "{word} one/act")' for word in ("count", "seeds")}
+    (checkout / "README.md").write_text(f"[]{told['count']} []{told['seeds']}\n")
+    maker.publish(piece)
+    assert git(checkout, "show", "HEAD:README.md") == f"[not run yet]{told['count']} [not run yet]{told['seeds']}\n"
+    maker.make(act)
+    assert git(checkout, "show", "HEAD:README.md") == f"[2]{told['count']} [1/1]{told['seeds']}\n", (
+        "rows are read anew"
+    )
+
+
+def test_a_process_that_was_killed_before_its_commit_makes_it_up(checkout, tmp_path, made, monkeypatch):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    monkeypatch.setattr(made, "ROOT", checkout)
+    monkeypatch.setattr(made, "PAGES", [checkout / "README.md"])
+    monkeypatch.setattr(made, "Maker", lambda *_, **options: maker)
+    monkeypatch.setattr(sys, "argv", ["make.py", "--only=tiny/two"])
+    with monkeypatch.context() as killed:
+        killed.setattr(maker, "publish", lambda piece: sys.exit("killed"))
+        with pytest.raises(SystemExit, match="killed"):
+            made.main()
+    assert not maker.is_committed(maker.pieces()[0])
+    made.main()
+    assert git(checkout, "log", "-1", "--format=%s") == "Results: tiny/two\n" and maker.is_committed(maker.pieces()[0])
 
 
 def test_nothing_is_made_of_sources_that_are_in_no_commit(checkout, tmp_path, made):
