@@ -13,9 +13,10 @@ before the next one begins, so that a killed run, or a clone on another machine,
 import subprocess
 import time
 from argparse import RawDescriptionHelpFormatter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
@@ -117,28 +118,37 @@ class Maker:
     def folder(self, study: str) -> Path:
         return self.root / "results" / study
 
+    @cached_property
+    def every(self) -> list[Piece]:
+        """All pieces."""
+        return [piece for name, config in self.configs.items() for piece in pieces_of(name, config.study)]
+
     def pieces(self, only: str = "") -> list[Piece]:
         """All pieces, or those whose names fit a pattern or begin with it.
 
         Raises:
             InputError: no piece does.
         """
-        every = [piece for name, config in self.configs.items() for piece in pieces_of(name, config.study)]
         chosen = [
-            one for one in every if not only or fnmatchcase(one.name, only) or f"{one.name}/".startswith(f"{only}/")
+            one
+            for one in self.every
+            if not only or fnmatchcase(one.name, only) or f"{one.name}/".startswith(f"{only}/")
         ]
         if not chosen:
-            raise InputError(f"--only={only} fits no piece; the first one is {every[0].name}.")
+            raise InputError(f"--only={only} fits no piece; the first one is {self.every[0].name}.")
         return chosen
 
-    def missing(self, piece: Piece) -> list[Run]:
-        """The runs of a piece that are to be made."""
-        table = Table(self.folder(piece.study), piece.runs, self.store, replaces=True)
-        return table.missing()
+    def due(self, pieces: Iterable[Piece]) -> Iterator[tuple[Piece, list[Run]]]:
+        """Each piece with its runs that are to be made, if any. A study's rows are read once for all that follow."""
+        for study, own in groupby(pieces, key=lambda piece: piece.study):
+            together = list(own)
+            runs = [run for piece in together for run in piece.runs]
+            absent = {run.id for run in Table(self.folder(study), runs, self.store, replaces=True).missing()}
+            yield from ((piece, [run for run in piece.runs if run.id in absent]) for piece in together)
 
     def status(self, pieces: Sequence[Piece]) -> str:
         """A line for each piece that is to be made, and their number."""
-        due = [(piece, runs) for piece in pieces if (runs := self.missing(piece))]
+        due = [(piece, runs) for piece, runs in self.due(pieces) if runs]
         lines = [f"{piece.name}: {plural(len(runs), 'run')}, {self.time(piece, runs)}" for piece, runs in due]
         return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made"])
 
@@ -167,7 +177,7 @@ class Maker:
 
     def discard(self, piece: Piece) -> None:
         """Remove the demonstrations and features of a piece that is made, unless another one will need them."""
-        left = [run for other in self.pieces() for run in self.missing(other)]
+        left = [run for _, runs in self.due(self.every) for run in runs]
         for node in _bulky(piece.runs) - _bulky(left):
             with self.store.claim([node]):
                 self.store.discard(node)
@@ -233,8 +243,8 @@ def main() -> None:
     if asked.status:
         say(maker.status(pieces))
         return
-    for piece in pieces:
-        if runs := maker.missing(piece):
+    for piece, runs in maker.due(pieces):
+        if runs:
             if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
                 say(f"Stopped before {piece.name}; the same command continues there")
                 return

@@ -91,8 +91,6 @@ class Arm:
 WORDS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "count": lambda arm: arm.met("placed").split("/")[0],
-    "lifted": lambda arm: arm.met("lifted"),
-    "seeds": lambda arm: arm.seeds("placed"),
     "each": Arm.in_order,
 }
 """Of links."""

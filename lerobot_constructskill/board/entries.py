@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate
+from lerobot_constructskill.analysis.stats.walls import over_seeds
 from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS, PublicValue
@@ -132,13 +133,14 @@ def _laid(claims: dict[int, list[Claim]], elements: int) -> Laid | None:
     every = [claim for own in claims.values() for claim in own]
     if any(claim.error is None and getattr(claim, name) is None for claim in every for name in SCORES):
         return None
-
-    def over_seeds(score: str, of: int) -> Estimate:
-        means = [np.mean([(getattr(claim, score) or 0) / of for claim in own]) for own in claims.values()]
-        return Estimate(float(np.mean(means)), float(min(means)), float(max(means)))
-
-    counts = {name: sum(getattr(claim, name) or 0 for claim in every) for name in ("drops", "knocks", "collisions")}
-    return Laid(elements, over_seeds("chain", 1), over_seeds("placements", elements), **counts)
+    counts = {name: [getattr(claim, name) or 0 for claim in every] for name in SCORES}
+    seeds = [claim.training_seed for claim in every]
+    return Laid(
+        elements,
+        over_seeds(counts["chain"], seeds),
+        over_seeds([count / elements for count in counts["placements"]], seeds),
+        **{name: sum(counts[name]) for name in ("drops", "knocks", "collisions")},
+    )
 
 
 def read_entries(root: Path) -> tuple[list[Entry], list[str]]:

@@ -17,7 +17,7 @@ from lerobot_constructskill.board.losses import by_seed, by_setting, checked, de
 from lerobot_constructskill.board.protocol import BOARD_SUITES, CLASSES, LEVELS, RANKED_FROM
 from lerobot_constructskill.board.recovered import MEANING, PATIENCE, STRIDES
 from lerobot_constructskill.board.rerun import describe
-from lerobot_constructskill.contract import STAGES, SUITES
+from lerobot_constructskill.contract import STAGES, get_task
 from lerobot_constructskill.errors import InputError, plural
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -84,7 +84,7 @@ def _suite_page(name: str, entries: list[Entry], out: Path, common: dict[str, An
         strides=STRIDES,
         films=lambda entry, column: films_there(entry, column, out),
         table=TABLE,
-        plans=SUITES["wall"],
+        has_plans=any(get_task(one.task).plan for one in columns.values()),
         **common,
     )
 

@@ -75,10 +75,12 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
 
 def _check_nothing_is_lost(table: Table) -> None:
     if lost := table.lost():
+        can_replace = {*lost} <= {run.id for run in table.runs}
+        other = "--replace=true to make them anew" if can_replace else "move the folder away"
         raise InputError(
             f"{table.root} has rows of {plural(len(lost), 'run')}, such as {lost[0]}, that are not of this study as "
             f"it is, or of other versions of packages or weights, and {table.store.root} does not keep them: they "
-            "would be lost. Give another --root, or --replace=true to make them anew."
+            f"would be lost. Give another --root, or {other}."
         )
 
 

@@ -202,8 +202,8 @@ class Options(Checked):
         workers: processes that generate demonstrations and simulate in rounds of DAgger; jobs at a time on a Ray of
             this machine.
         retry_failed: make runs again that failed before.
-        replace: take the place of rows that were made of other code, packages or weights, and that the store does not
-            keep: those of a setting's variant stand until a run of it is made. Without it such a folder is refused.
+        replace: drop rows that other code, packages or weights made and that the store does not keep, those of a
+            setting's variant as soon as one of its runs is made anew. Without it such a folder is refused.
 
     Raises:
         ValueError: a count below 1 or an unknown executor.

@@ -100,12 +100,12 @@ def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkou
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
     elsewhere = made.Maker(clone, tmp_path / "another_store", ["tiny"])
-    assert [piece.name for piece in elsewhere.pieces() if elsewhere.missing(piece)] == ["tiny/one", "tiny/one/act"]
-    for piece in elsewhere.pieces():
-        if elsewhere.missing(piece):
-            elsewhere.make(piece)
-    for piece in maker.pieces():
-        if maker.missing(piece):
+    left = [piece for piece, runs in elsewhere.due(elsewhere.pieces()) if runs]
+    assert [piece.name for piece in left] == ["tiny/one", "tiny/one/act"]
+    for piece in left:
+        elsewhere.make(piece)
+    for piece, runs in maker.due(maker.pieces()):
+        if runs:
             maker.make(piece)
     assert load_rows(clone / "results/tiny" / ROWS) == load_rows(checkout / "results/tiny" / ROWS)
     assert (clone / "results/tiny/report.md").read_text() == (checkout / "results/tiny/report.md").read_text()
@@ -121,12 +121,12 @@ def test_the_numbers_of_a_page_are_committed_with_their_rows(checkout, tmp_path,
     maker.publish(piece)
     assert git(checkout, "show", "HEAD:README.md") == f"It places [4/4]{link}.\n"
     (act,) = maker.pieces("tiny/one/act")
-    told = {word: f'(results/tiny/report.md "{word} one/act")' for word in ("count", "seeds")}
-    (checkout / "README.md").write_text(f"[]{told['count']} []{told['seeds']}\n")
+    told = {word: f'(results/tiny/report.md "{word} one/act")' for word in ("count", "placed")}
+    (checkout / "README.md").write_text(f"[]{told['count']} []{told['placed']}\n")
     maker.publish(piece)
-    assert git(checkout, "show", "HEAD:README.md") == f"[not run yet]{told['count']} [not run yet]{told['seeds']}\n"
+    assert git(checkout, "show", "HEAD:README.md") == f"[not run yet]{told['count']} [not run yet]{told['placed']}\n"
     maker.make(act)
-    assert git(checkout, "show", "HEAD:README.md") == f"[2]{told['count']} [1/1]{told['seeds']}\n", (
+    assert git(checkout, "show", "HEAD:README.md") == f"[2]{told['count']} [2/2]{told['placed']}\n", (
         "rows are read anew"
     )
 

@@ -506,6 +506,8 @@ def test_rows_of_other_code_are_replaced_an_arm_at_a_time(tmp_path):
     assert others == [row for row in older if row.variant != "a"]
     fewer = study(variants={"a": study().variants["a"]})
     assert Table(tmp_path / "x", list_runs(fewer), mine, replaces=True).lost() == ["fixed/b/seed_0", "fixed/b/seed_1"]
+    with pytest.raises(InputError, match="would be lost. Give another --root, or move the folder away"):
+        run_study(fewer, "", tmp_path / "x", mine, Options(replace=True))
 
 
 def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_path):

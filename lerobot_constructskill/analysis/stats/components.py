@@ -53,7 +53,7 @@ def split(episodes: pd.DataFrame) -> Components | None:
             warnings.simplefilter("ignore", of_a_component_at_0)  # which its interval says
         try:
             fit = model.fit(reml=True, method="powell")  # others stop short where a component is 0
-        except np.linalg.LinAlgError:
+        except np.linalg.LinAlgError:  # hardly anything is left beside the components
             return None
         found = _deviations(fit, model.exog_vc.names)
     if not np.isfinite([one.value for one in found.values()]).all():

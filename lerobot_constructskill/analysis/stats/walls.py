@@ -1,6 +1,7 @@
 """From episodes of a wall to what a mason asks: how far the chain came, where it broke, and how true it stands."""
 
 import json
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -47,16 +48,17 @@ def wall_of(episodes: pd.DataFrame) -> Wall | None:
     off = [np.hypot(*error[:2]) for one, chain in laid for error in one["errors"][:chain]]
     return Wall(
         elements,
-        _over_seeds(chains, measured),
-        _over_seeds(placed / elements, measured),
+        over_seeds(chains, measured["training_seed"]),
+        over_seeds(placed / elements, measured["training_seed"]),
         [int((chains == count).sum()) for count in range(elements + 1)],
         float(np.median(off)) if off else None,
         *(_mean(read, name) for name in ("length", "level", "line")),
     )
 
 
-def _over_seeds(values: pd.Series, rows: pd.DataFrame) -> Estimate:
-    means = values.groupby(rows["training_seed"].to_numpy()).mean()
+def over_seeds(values: Iterable[float], seeds: Iterable[int]) -> Estimate:
+    """Mean over training seeds of the mean of a seed's episodes; its ends are the lowest and highest of a seed."""
+    means = pd.Series([*values], dtype=float).groupby([*seeds]).mean()
     return Estimate(float(means.mean()), float(means.min()), float(means.max()))
 
 
