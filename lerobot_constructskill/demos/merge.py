@@ -18,6 +18,7 @@ from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions
 from lerobot_constructskill.demos.shards import Block
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import read_parquet
+from lerobot_constructskill.progress import quiet
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -45,7 +46,7 @@ def merge(config: GenerateConfig, blocks: list[Block], folder: Path) -> None:
         )
     roots = [root for block in blocks for root in block.demonstrations]
     # The disk's room is measured before the scratch folder is gone.
-    with tempfile.TemporaryDirectory(dir=blocks[0].shards) as scratch, room_for(folder):
+    with tempfile.TemporaryDirectory(dir=blocks[0].shards) as scratch, room_for(folder), quiet():
         aggregate(config.repo_id, roots, folder, Path(scratch))
     write_statistics(folder)
     if config.annotate:

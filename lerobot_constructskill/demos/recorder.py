@@ -13,14 +13,14 @@ from pathlib import Path
 from lerobot_constructskill.artifacts.code import check_unedited
 from lerobot_constructskill.artifacts.disk import disk_of
 from lerobot_constructskill.artifacts.folders import staged
-from lerobot_constructskill.artifacts.pools import open_pool
+from lerobot_constructskill.artifacts.pools import Submit, open_pool
 from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP
 from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
 from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, Block, attempt, whole
 from lerobot_constructskill.demos.video import VIDEOS
 from lerobot_constructskill.errors import InputError, MachineError, plural
-from lerobot_constructskill.progress import Progress, quiet
+from lerobot_constructskill.progress import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -63,14 +63,16 @@ def write(config: GenerateConfig, folder: Path) -> list[Attempt]:
     shards = folder.with_name(SHARDS)
     blocks = [Block(part, shards / frames_digest(part)) for part in config.parts]
     before = frame_versions(config)
-    _run_attempts(config, blocks)
-    check_unedited(before, frame_versions(config))
-    with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False), quiet():
-        merge(config, blocks, folder)
+    with open_pool(config.executor, config.workers) as submit:
+        _run_attempts(config, blocks, submit)
+        check_unedited(before, frame_versions(config))
+        with Progress(desc="merging", bar_format="{desc} {elapsed}", leave=False):
+            # By a worker, which has imported LeRobot: that would take this process 5 to 16 s.
+            submit(merge, config, blocks, folder).result()
     return [attempt for block in blocks for attempt in block.attempts]
 
 
-def _run_attempts(config: GenerateConfig, blocks: list[Block]) -> None:
+def _run_attempts(config: GenerateConfig, blocks: list[Block], submit: Submit) -> None:
     """Run attempts, or find their shards, until enough have succeeded in every block.
 
     No more attempts of a block run at once than it still needs, so which seeds are taken does not depend on the
@@ -83,7 +85,7 @@ def _run_attempts(config: GenerateConfig, blocks: list[Block]) -> None:
     total = config.episodes * len(blocks)
     # Smoothed, so that the start of the simulators, part of the first demonstration's time, counts less and less.
     bar = Progress(total=total, initial=found, desc="demonstrations", unit="demo", smoothing=0.1)
-    with bar, open_pool(config.executor, config.workers) as submit:
+    with bar:
         while True:
             bar.set_postfix(discarded=sum(len(block.discarded) for block in blocks), refresh=False)
             bar.update(max(0, sum(len(block.demonstrations) for block in blocks) - bar.n))

@@ -1,17 +1,22 @@
 """Many agents evaluated in lockstep, with an environment each.
 
 They step in two halves: the environments of one are at work while the agents of the other act. Those of a half that
-share an encoder have one batch of it.
+share an encoder have one batch of it. An agent that looks at no picture, as the expert, is
+copied: its episodes run side by side, and only the first is rendered.
 """
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from itertools import batched
+from math import ceil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lerobot_constructskill.artifacts.pools import cores
 from lerobot_constructskill.contract import FPS, OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import STARTING, Episode, deciding
 from lerobot_constructskill.lerobot_internals import write_video
@@ -19,7 +24,7 @@ from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.plans.measure import measured
 from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.progress import Progress, quiet
-from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, caught
+from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent, caught
 from lerobot_constructskill.rollout.simulators import Answers, Simulators, Step, simulators
 
 OnStep = Callable[[int, int, np.ndarray, Step], None]
@@ -57,7 +62,8 @@ def roll_out(
     Args:
         seeds: for each agent those of its episodes' initial states.
         n_workers: simulator processes; one per core by default.
-        filmed: agents of whom `on_step` is shown every camera; of others, those that the agent looks at.
+        filmed: agents of whom `on_step` is shown every camera, in the first episode at least; of others, those that
+            the agent looks at.
 
     Yields:
         An agent's number and its rollout, as soon as it has finished or failed.
@@ -65,21 +71,79 @@ def roll_out(
     Raises:
         OSError: a simulator's process died.
     """
-    envs = [env_kwargs if i in filmed else _rendered(agent, env_kwargs) | env_kwargs for i, agent in enumerate(agents)]
+    n_workers = n_workers or cores()
+    lanes = [
+        lane
+        for number, (agent, own) in enumerate(zip(agents, seeds, strict=True))
+        for lane in _lanes_of(number, agent, own, env_kwargs, number in filmed, n_workers)
+    ]
+    on_lanes_step = on_step and _as_of_agents(on_step, lanes)
     with (
-        simulators(envs, n_workers) as sims,
+        simulators([lane.env for lane in lanes], n_workers) as sims,
         Progress(total=sum(map(len, seeds)), unit="episode", desc="rollout") as bar,
     ):
-        shared = Lockstep(agents)
+        shared = Lockstep([lane.agent for lane in lanes])
         groups = [
-            _Lanes(numbers, agents, shared, env_kwargs, sims, seeds, on_step)
-            for numbers in _halves(range(len(agents)))
+            _Together(numbers, lanes, shared, env_kwargs, sims, on_lanes_step)
+            for numbers in _halves(range(len(lanes)))
         ]
+        over: dict[int, dict[int, Rollout]] = {number: {} for number in range(len(agents))}  # by agent and lane
         bar.unpause()  # until now the simulators started
         while any(group.running or group.over for group in groups):
             for group in groups:
                 bar.update(group.advance())
-                yield from group.finished()
+                for i, rollout in group.finished():
+                    number = lanes[i].number
+                    over[number][i] = rollout
+                    if len(over[number]) == sum(lane.number == number for lane in lanes):
+                        yield number, _joined([one for _, one in sorted(over.pop(number).items())])
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """Episodes of an agent, one after another in an environment.
+
+    Args:
+        number: of the agent, whose copies have it too.
+        first: which of the agent's episodes comes first.
+        seeds: those of the episodes' initial states.
+        env: keyword arguments of the environment.
+    """
+
+    number: int
+    agent: Agent
+    first: int
+    seeds: Sequence[int]
+    env: Mapping[str, Any]
+
+
+def _lanes_of(
+    number: int, agent: Agent, seeds: Sequence[int], env_kwargs: Mapping[str, Any], is_filmed: bool, n_workers: int
+) -> list[_Lane]:
+    """An agent's lanes: one, but for an agent that looks at no camera and is no policy, which may be large."""
+    offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
+    looked = getattr(agent, "cameras", offered)
+    # At least one picture is rendered, because a row says what backend did it.
+    cameras = {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
+    env = env_kwargs if is_filmed else cameras | env_kwargs
+    if looked or isinstance(agent, PolicyAgent) or len(seeds) < 2:
+        return [_Lane(number, agent, 0, seeds, env)]
+    unseen = {**env_kwargs, "render_backend": "none"}
+    shares = [*batched(range(1, len(seeds)), ceil((len(seeds) - 1) / n_workers))]  # noqa: B911  the last may be shorter
+    others = [_Lane(number, deepcopy(agent), share[0], seeds[share[0] : share[-1] + 1], unseen) for share in shares]
+    return [_Lane(number, agent, 0, seeds[:1], env), *others]
+
+
+def _as_of_agents(on_step: OnStep, lanes: Sequence[_Lane]) -> OnStep:
+    """`on_step` as it is called with a lane's number in place of the agent's."""
+    return lambda i, episode, action, step: on_step(lanes[i].number, lanes[i].first + episode, action, step)
+
+
+def _joined(rollouts: Sequence[Rollout]) -> Rollout:
+    """The rollout of an agent from those of its lanes, in their order."""
+    failed = [rollout for rollout in rollouts if rollout.error]
+    episodes = [episode for rollout in rollouts for episode in rollout.episodes]
+    return failed[0] if failed else Rollout(episodes, backend=rollouts[0].backend)
 
 
 def _halves(numbers: range) -> list[range]:
@@ -88,32 +152,24 @@ def _halves(numbers: range) -> list[range]:
     return [half for half in (numbers[:middle], numbers[middle:]) if half]
 
 
-def _rendered(agent: Agent, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Which cameras to render: those that an agent looks at, one at least, as a row says what backend rendered."""
-    offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
-    looked = getattr(agent, "cameras", offered)
-    return {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
-
-
-class _Lanes:
-    """Agents that step together, and what their environments were asked last.
+class _Together:
+    """Lanes that step together, and what their environments were asked last.
 
     Args:
-        numbers: which of `agents` they are.
+        numbers: which of `lanes` they are.
         shared: what all agents compute together.
     """
 
     def __init__(
         self,
         numbers: Sequence[int],
-        agents: Sequence[Agent],
+        lanes: Sequence[_Lane],
         shared: Lockstep,
         env_kwargs: Mapping[str, Any],
         sims: Simulators,
-        seeds: Sequence[Sequence[int]],
         on_step: OnStep | None,
     ):
-        self.agents, self.shared, self.sims, self.seeds, self.on_step = agents, shared, sims, seeds, on_step
+        self.lanes, self.shared, self.sims, self.on_step = lanes, shared, sims, on_step
         task = get_task(env_kwargs.get("task", "brick_to_bin"))
         perturbation = Perturbation(env_kwargs.get("perturb", ""), env_kwargs.get("perturb_seed", 0))
         self.instruction, self.plan = perturbation.told(task).instruction, task.plan and read_plan(task.plan)
@@ -130,7 +186,7 @@ class _Lanes:
         ended = [i for i, step in current.items() if step.done]
         for i in ended:
             self.running[i].backend = current.pop(i).backend
-        again = [i for i in ended if len(self.running[i].episodes) < len(self.seeds[i])]
+        again = [i for i in ended if len(self.running[i].episodes) < len(self.lanes[i].seeds)]
         self.over |= {i: self.running.pop(i) for i in ended if i not in again}
         self.asked = [self._start(again)]  # before others act, so that it goes on meanwhile
         seen = {i: Observation(step.seen, step.sim, self.instruction) for i, step in current.items()}
@@ -139,12 +195,12 @@ class _Lanes:
         return len(ended)
 
     def finished(self) -> Iterator[tuple[int, Rollout]]:
-        """The agents that have finished or failed since the last time."""
+        """The lanes that have finished or failed since the last time."""
         over, self.over = self.over, {}
         yield from over.items()
 
     def _keep(self, i: int, step: Step) -> None:
-        """Add an agent's step to its episode."""
+        """Add a lane's step to its episode."""
         episodes, action = self.running[i].episodes, self.actions[i]
         episodes[-1].add(action, step.info)
         episodes[-1].final_error_m = float(np.linalg.norm(step.sim["object_pose"][:3] - step.sim["bin_position"]))
@@ -154,15 +210,15 @@ class _Lanes:
             self.on_step(i, len(episodes) - 1, action, step)
 
     def _start(self, numbers: Sequence[int]) -> Answers:
-        """Begin the next episode of these agents."""
-        seeds = {i: self.seeds[i][len(self.running[i].episodes)] for i in numbers}
+        """Begin the next episode of these lanes."""
+        seeds = {i: self.lanes[i].seeds[len(self.running[i].episodes)] for i in numbers}
         for i, seed in seeds.items():
             self.running[i].episodes.append(Episode(seed))
-        ready = self._succeeded({i: caught(self.agents[i].reset, seed) for i, seed in seeds.items()})
+        ready = self._succeeded({i: caught(self.lanes[i].agent.reset, seed) for i, seed in seeds.items()})
         return self.sims.reset({i: seeds[i] for i in ready})
 
     def _succeeded(self, results: dict[int, Any]) -> dict[int, Any]:
-        """The results that are no exception; an agent whose result is one has failed."""
+        """The results that are no exception; a lane whose result is one has failed."""
         failed = {i: result for i, result in results.items() if isinstance(result, Exception)}
         for i, error in failed.items():
             del self.running[i]

@@ -46,16 +46,21 @@ def attempted(monkeypatch):
     return seeds
 
 
-def run_attempts(config, folder):
+def run_attempts(config, blocks):
+    with recorder.open_pool(config.executor, config.workers) as submit:
+        recorder._run_attempts(config, blocks, submit)
+
+
+def attempts_of(config, folder):
     """The attempts at the only task, whose shards are in `folder`."""
     block = Block(config, folder)
-    recorder._run_attempts(config, [block])
+    run_attempts(config, [block])
     return block.attempts
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3, 8])
 def test_the_first_successes_in_the_order_of_seeds_are_taken_whatever_the_workers(workers, attempted, tmp_path):
-    attempts = run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    attempts = attempts_of(replace(CONFIG, workers=workers), tmp_path)
     assert [attempt.seed for attempt in attempts] == sorted(attempted) == list(range(10))
     assert [attempt.seed for attempt in attempts if attempt.success] == [1, 2, 5, 6, 7, 9]
 
@@ -68,7 +73,7 @@ def test_the_attempts_of_each_of_several_tasks_are_those_of_the_task_alone(worke
     (tmp_path / "block_to_bin" / "3" / shards.OUTCOME).write_text(
         json.dumps(asdict(Attempt(3, False, 9, True, "cpu")))
     )
-    recorder._run_attempts(config, blocks)
+    run_attempts(config, blocks)
     assert [block.config.task for block in blocks] == [*SUITES["bins"]]
     for block in blocks:
         assert [attempt.seed for attempt in block.attempts] == list(range(10)) and block.discarded == [0, 3, 4, 8]
@@ -78,7 +83,7 @@ def test_the_attempts_of_each_of_several_tasks_are_those_of_the_task_alone(worke
 def test_a_task_of_several_at_which_too_many_attempts_fail_ends_the_run(attempted, tmp_path):
     config = replace(CONFIG, task="bins", max_failures=0.5)
     with pytest.raises(InputError, match="4 attempts at brick_to_bin failed"):
-        recorder._run_attempts(config, [Block(part, tmp_path / part.task) for part in config.parts])
+        run_attempts(config, [Block(part, tmp_path / part.task) for part in config.parts])
 
 
 def test_shards_of_a_task_serve_a_set_of_several():
@@ -115,7 +120,7 @@ def test_finished_shards_are_not_run_again_and_half_written_ones_are(workers, at
         )
     (tmp_path / "5.partial" / "dataset").mkdir(parents=True)
     (tmp_path / "5.partial" / "dataset" / shards.OUTCOME).touch()
-    attempts = run_attempts(replace(CONFIG, workers=workers), tmp_path)
+    attempts = attempts_of(replace(CONFIG, workers=workers), tmp_path)
     assert [attempt.seed for attempt in attempts] == list(range(10))
     assert sorted(attempted) == [0, 2, 3, 5, 6, 8, 9]
 
@@ -180,7 +185,7 @@ def test_machines_that_draw_the_robot_differently_are_not_mixed(tmp_path):
 def test_an_attempt_that_lost_its_content_is_run_again(content, attempted, tmp_path):
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / shards.OUTCOME).write_text(content)
-    attempts = run_attempts(CONFIG, tmp_path)
+    attempts = attempts_of(CONFIG, tmp_path)
     assert sorted(attempted) == [attempt.seed for attempt in attempts] == list(range(10))
     assert not (tmp_path / "1").exists()  # in the way of the new one
 

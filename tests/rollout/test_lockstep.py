@@ -10,7 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
-from lerobot_constructskill.contract import GRIPPER_CLOSED
+from lerobot_constructskill.contract import GRIPPER_CLOSED, get_task
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.recording import COUNTS
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
@@ -18,6 +18,7 @@ from lerobot_constructskill.policies.frozen_vit.precision import native_precisio
 from lerobot_constructskill.rollout import lockstep
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import roll_out
+from lerobot_constructskill.rollout.references import REFERENCES
 from lerobot_constructskill.rollout.simulators import Step
 
 pytestmark = [pytest.mark.sim]
@@ -218,6 +219,40 @@ def test_an_agent_is_shown_what_it_looks_at_and_who_is_filmed_or_does_not_say_ev
     monkeypatch.undo()
     policy.policy.config.input_features = {"observation.images.top": IMAGE}
     assert policy.cameras == both
+
+
+def same_actions(one, other):
+    return np.array_equal(np.concatenate(one.actions), np.concatenate(other.actions))
+
+
+@pytest.mark.parametrize(("name", "workers"), [("random", 1), ("expert", 2)])
+def test_an_agent_that_looks_at_no_camera_has_the_episodes_that_it_has_one_after_another(name, workers):
+    """They are shared out, and only the first is rendered; perturbed, as no draw may depend on pictures."""
+    perturb = "camera=1,light=1,texture=1,distractors=1,pose=1"
+    env = {"task": "course_of_three", "obs_type": "pixels_agent_pos", "episode_length": 40, "perturb": perturb}
+    starts, task = range(1000, 1005), get_task("course_of_three")
+    agent, looking = (REFERENCES[name].agent(task, 0, None) for _ in range(2))
+    looking.cameras = ("base",)
+    shown = []
+    keep = lambda number, episode, _, step: shown.append((number, episode, len(step.seen["pixels"])))  # noqa: E731
+    (_, shared), (_, alone) = sorted(roll_out([agent, looking], env, [starts] * 2, workers, keep, filmed=[0]))
+    assert not (shared.error or alone.error) and len(shared.episodes) == 5
+    assert str(shared) == str(alone) and all(map(same_actions, shared.episodes, alone.episodes))
+    assert {pictures for number, episode, pictures in shown if number == 0 and episode == 0} == {2}
+    assert {pictures for number, episode, pictures in shown if number == 0 and episode > 0} == {0}
+    assert {episode for number, episode, _ in shown if number == 0} == {*range(5)}
+
+
+def test_an_agent_one_of_whose_episodes_fails_has_failed():
+    class Falling(Broken):
+        cameras = ()
+
+        def reset(self, seed):
+            super().reset(seed)
+            self.action = None if seed == 1003 else np.zeros(4, dtype=np.float32)
+
+    ((_, outcome),) = roll_out([Falling(None)], ENV, [range(1000, 1005)], n_workers=2)
+    assert "lost the plot" in str(outcome.error) and outcome.episodes == []
 
 
 def test_a_failing_agent_is_recorded_and_the_others_go_on():

@@ -29,6 +29,7 @@ from .weights import (
     Build,
     Encode,
     hub_file,
+    import_timm,
 )
 
 IMAGE_SIZE = 224
@@ -86,8 +87,7 @@ def _describe(name: str, path: str | None) -> Backbone:
 
 
 def _describe_timm(name: str, model: str, revision: str) -> Backbone:
-    import timm
-
+    timm = import_timm()
     try:
         facts = timm.get_pretrained_cfg(model, allow_unregistered=False)
     except RuntimeError:
@@ -172,8 +172,7 @@ def _on_meta(build: Build) -> nn.Module:
 
 
 def _build_timm(model: str) -> nn.Module:
-    import timm
-
+    timm = import_timm()
     try:  # as large as it was trained, so that its own position embeddings are loaded and then resampled
         return timm.create_model(model, pretrained=False, num_classes=0, dynamic_img_size=True)
     except TypeError:  # it has none, or of one size alone

@@ -10,11 +10,13 @@ import importlib.util
 import logging
 import os.path
 import pickle
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
 import torch
 from safetensors.torch import load_file
@@ -160,10 +162,22 @@ def _read_dinov2(file: Path) -> State:
     return {name.removeprefix("backbone."): tensor for name, tensor in state.items()}
 
 
+def import_timm() -> ModuleType:
+    """timm. Its own training script logs to wandb, which it would import here, for 5 s; nobody logs."""
+    unneeded = "wandb" not in sys.modules
+    if unneeded:
+        sys.modules["wandb"] = None  # type: ignore[assignment]  # then an import raises ImportError, which timm expects
+    try:
+        import timm
+    finally:
+        if unneeded:
+            del sys.modules["wandb"]
+    return timm
+
+
 def _read_efficientnet_lite(size: int, file: Path) -> State:
     """EfficientNet-Lite under timm's names: its author's module has the same layers in the same order."""
-    import timm
-
+    timm = import_timm()
     with torch.device("meta"):
         names = timm.create_model(f"tf_efficientnet_lite{size}", num_classes=0).state_dict()
     theirs = {name: tensor for name, tensor in read_tensors(file).items() if not name.startswith("_fc")}
