@@ -20,6 +20,7 @@ from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
+from entries import keep, write_whole
 from render import PAGES, render
 
 from lerobot_constructskill.artifacts.folders import write_text
@@ -183,15 +184,22 @@ class Maker:
                 self.store.discard(node)
 
     def publish(self, piece: Piece) -> None:
-        """Write the report of a piece's study and the numbers in pages, and commit them with its rows."""
+        """Write the report of a piece's study and the numbers in pages, and commit them with its rows.
+
+        Then write the entries of the board that it was the last piece of, and commit these.
+
+        Raises:
+            InputError: an entry cannot be made of its runs. Everything else is committed.
+        """
         report(ReportConfig(self.folder(piece.study)))
         for page in self._pages:
             write_text(page, render(page))
-        _remove_unseen(self.folder(piece.study) / "figures", self._pages)
-        paths = ["--", self.folder(piece.study), *self._pages]
-        self._git("add", *paths)
-        if self._git("diff", "--cached", "--name-only", *paths):
-            self._git("commit", "--quiet", f"--message=Results: {piece.name}", *paths)
+        folder, board = self.folder(piece.study), self.root / "board"
+        _remove_unseen(folder / "figures", self._pages)
+        keep(folder, piece.study, piece.runs, self.store)
+        self._commit(f"Results: {piece.name}", folder, *self._pages)
+        if entries := write_whole(folder, piece.study, board, self._git("rev-parse", "--short", "HEAD").strip()):
+            self._commit(f"Board: {', '.join(entries)}", folder, board)
 
     @property
     def _pages(self) -> list[Path]:
@@ -200,6 +208,11 @@ class Maker:
     def _check_sources(self) -> None:
         if edited := self._git("status", "--porcelain", "--", *SOURCES).splitlines():
             raise InputError(f"Commit your edits first, so that a commit makes the rows again: {edited[0][3:]}")
+
+    def _commit(self, message: str, *paths: Path) -> None:
+        self._git("add", "--all", "--", *paths)
+        if self._git("diff", "--cached", "--name-only", "--", *paths):
+            self._git("commit", "--quiet", f"--message={message}", "--", *paths)
 
     def _git(self, *arguments) -> str:
         command = ["git", "-C", self.root, *arguments]

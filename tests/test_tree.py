@@ -12,7 +12,15 @@ ROOT = Path(__file__).parents[1]
 SHOWN = ("results", "docs", "datasets_cards", "examples")
 PAGES = [ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("results/**/*.md")]
 ARCHIVES = {".7z", ".bz2", ".gz", ".rar", ".tar", ".tgz", ".whl", ".xz", ".zip", ".zst"}
-OF_A_STUDY = {"study.yaml", "rows.parquet", "report.md", "notes.md", "provenance.json", "timings.jsonl"}
+OF_A_STUDY = {
+    "study.yaml",
+    "rows.parquet",
+    "recordings.parquet",
+    "report.md",
+    "notes.md",
+    "provenance.json",
+    "timings.jsonl",
+}
 
 if not (ROOT / ".git").exists():
     pytest.skip("this is no clone", allow_module_level=True)

@@ -1,14 +1,21 @@
-"""`make results`: pieces are made once, committed one by one, and go on in another checkout."""
+"""`make results`: pieces are made once, committed one by one, and go on elsewhere; so do entries of the board."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.board.declaration import About
+from lerobot_constructskill.board.from_recordings import submit
+from lerobot_constructskill.board.protocol import BOARD_SUITES, BoardSetting
+from lerobot_constructskill.board.submission import read_submission
+from lerobot_constructskill.envs.recording import COUNTS, RECORDINGS, Episode, deciding, write_recordings
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study import session
 from lerobot_constructskill.study.rows import ROWS, EpisodeRow, load_rows, write_rows
@@ -77,11 +84,28 @@ def make_at_once(job):
                 with job.store.writing(node) as folder:
                     folder.mkdir()
                     row = EpisodeRow(
-                        run=run.digest, training_seed=run.seed, evaluation_seed=1000, episode=0, versions="{}"
+                        run=run.digest,
+                        training_seed=run.seed,
+                        evaluation_seed=1000,
+                        episode=0,
+                        versions='{"processor": "a processor"}',
                     )
                     rows = [replace(row, episode=number, placed=True, lifted=True) for number in range(2)]
                     write_rows(rows, folder / EPISODES, EpisodeRow)
+                    write_recordings(recorded(run.arm.env["episode_length"], run.seed), folder / RECORDINGS)
         yield run
+
+
+def recorded(length, seed):
+    """Two episodes in which nothing happens, of another policy for each seed."""
+    facts = {"task": "brick_to_bin", "episode_length": length, "obs_type": "pixels_agent_pos"}
+    facts |= {"backend": "physx_cpu, sapien_cpu rendering", "versions": json.dumps(deciding())}
+    nothing = dict.fromkeys(("is_lifted", "is_in_bin", "is_success"), False) | dict.fromkeys((*COUNTS, "cost"), 0)
+    episodes = [Episode(start, **facts) for start in (1000, 1001)]
+    for episode in episodes:
+        for _ in range(length):
+            episode.add(np.full(4, 0.01 * (seed + 1), dtype=np.float32), nothing)
+    return episodes
 
 
 def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkout, tmp_path, made):
@@ -173,3 +197,56 @@ def test_what_no_piece_needs_any_more_can_be_removed(checkout, tmp_path, made):
 def test_every_study_that_the_benchmark_stands_on_has_a_folder_and_no_other_has(made):
     folders = {path.parent.name for path in (ROOT / "results").glob("*/study.yaml")}
     assert folders == {*made.STUDIES} and len(made.STUDIES) <= 10
+
+
+def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_the_others_were(
+    checkout, tmp_path, made, monkeypatch
+):
+    """Its replay, which has tests of its own, is left out: these episodes were never run."""
+    import entries
+
+    settings = {
+        name: BoardSetting("brick_to_bin", episodes=2, episode_length=length, first_start=1000)
+        for name, length in (("one", 8), ("two", 9))
+    }
+    about = About("of old", "me", "frozen_vit", "an old commit", "smoke", "twice", "a computer", "pixels_agent_pos")
+    old = {3: [*recorded(8, 3), *recorded(9, 3)]}
+    submit(checkout / "board/entries/mine", about, next(iter(BOARD_SUITES)), settings, old, {})
+    (checkout / "board/recovered").mkdir()
+    (checkout / "board/recovered/mine.parquet").touch()
+    git(checkout, "add", "board")
+    git(checkout, "commit", "--quiet", "--message=an entry")
+    replayed = []
+    monkeypatch.setattr(entries, "ENTRIES", {"mine": entries.Entry("tiny", "a", ("one", "two"))})
+    monkeypatch.setattr(entries, "verify", lambda config: replayed.append(config.root) or "it holds")
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    maker.make(maker.pieces("tiny/two")[0])
+    there = git(checkout, "ls-files", "results/tiny/recordings").split()
+    assert len(there) == 2 and not replayed and read_submission(checkout / "board/entries/mine").claims[0].key[1] == 3
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
+    elsewhere = made.Maker(clone, tmp_path / "another_store", ["tiny"])
+    elsewhere.make(elsewhere.pieces("tiny/one")[0])
+    entry = read_submission(clone / "board/entries/mine")
+    assert replayed == [clone / "board/entries/mine"] and git(clone, "log", "-1", "--format=%s") == "Board: mine\n"
+    assert {claim.key for claim in entry.claims} == {
+        (name, seed, start) for name in ("one", "two") for seed in (0, 1) for start in (1000, 1001)
+    }
+    assert entry.declaration.about.compute == "2 cores of a processor, no GPU" and entry.recipe
+    assert entry.declaration.about.revision.startswith("study tiny of results/tiny, variant a, commit ")
+    assert not git(clone, "ls-files", "results/tiny/recordings", "board/recovered")
+    assert not git(clone, "status", "--porcelain")
+
+
+def test_every_entry_that_is_made_of_a_study_is_on_the_board_and_names_settings_that_the_study_has(made):
+    from entries import ENTRIES
+
+    maker = made.Maker(ROOT, ROOT / "outputs" / "store")
+    runs = {study: [run for piece in maker.pieces(study) for run in piece.runs] for study in made.STUDIES}
+    for name, entry in ENTRIES.items():
+        told = read_submission(ROOT / "board" / "entries" / name).declaration
+        places = {(one.task, one.episode_length, one.perturb) for one in told.settings.values()}
+        own = [run for run in runs[entry.study] if entry.holds(run)]
+        assert {run.arm.setting for run in own} == {*entry.settings}, name
+        envs = [run.arm.env for run in own]
+        assert {(env["task"], env["episode_length"], env["perturb"]) for env in envs} == places, name

@@ -1,0 +1,127 @@
+"""The board's entries that are made of published studies.
+
+What an entry's runs executed is kept beside their study's rows, in `results/NAME/recordings`, from piece to piece and
+machine to machine. When all of it is there, the entry is written and replayed, and the recordings go.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pandas as pd
+
+from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.board import from_recordings
+from lerobot_constructskill.board.declaration import Declaration
+from lerobot_constructskill.board.protocol import LEVEL, PERTURBED_AXES
+from lerobot_constructskill.board.submission import read_submission
+from lerobot_constructskill.envs.recording import RECORDINGS
+from lerobot_constructskill.scripts.console import say
+from lerobot_constructskill.scripts.verify import VerifyConfig, verify
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
+from lerobot_constructskill.study.runs import Run
+
+KEPT = "recordings"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry that is a variant of a study in some of its settings."""
+
+    study: str
+    variant: str
+    settings: tuple[str, ...]
+
+    def holds(self, run: Run) -> bool:
+        return run.arm.name == self.variant and run.arm.setting in self.settings
+
+    def rows(self, folder: Path) -> pd.DataFrame:
+        """A row for each of its runs in a study's folder."""
+        rows = read_rows(folder / ROWS).drop_duplicates(["setting", "variant", "training_seed"])
+        return rows[(rows["variant"] == self.variant) & rows["setting"].isin(self.settings)]
+
+    def is_whole(self, folder: Path) -> bool:
+        """Whether each of its runs has failed, or what it executed is kept."""
+        rows = self.rows(folder)
+        finished = rows[rows["error_kind"].isna()]
+        return (
+            {*rows["setting"]} == {*self.settings}
+            and NOT_RUN not in {*rows["error_kind"]}
+            and all(kept(folder, run).is_file() for run in finished["run"])
+        )
+
+
+JOINTS = ("brick_on_brick", "tile_to_grid", "tenon_to_mortise")
+LADDER = tuple(f"brick_to_bin_{clearance}mm" for clearance in (40, 20, 10, 5, 3))
+PERTURBED = ("control", *(f"{axis}_{LEVEL}" for axis in PERTURBED_AXES))
+
+ENTRIES = {
+    "joints_precise": Entry("precise", "precise", JOINTS),
+    "ladder_precise": Entry("precise", "precise", LADDER),
+    "precise_turned": Entry("precise", "more", ("brick_to_bin_turned",)),
+    "precise_shifted": Entry("perturbed", "precise", ("control",)),
+    "precise_perturbed": Entry("perturbed", "precise", PERTURBED),
+    "act_shifted": Entry("other_policies", "act", ("shifted",)),
+    "diffusion_shifted": Entry("other_policies", "diffusion", ("shifted",)),
+}
+"""Folder in `board/entries` to what it is made of."""
+
+
+def kept(folder: Path, run: str) -> Path:
+    """Where a study's folder keeps what a run executed: laid out as a store is."""
+    return folder / KEPT / "runs" / run / RECORDINGS
+
+
+def keep(folder: Path, study: str, runs: Iterable[Run], store: Store) -> None:
+    """Copy to a study's folder what runs executed of which an entry is made."""
+    entries = [entry for entry in ENTRIES.values() if entry.study == study]
+    for run in runs:
+        made, copy = store.folder(run) / RECORDINGS, kept(folder, run.digest)
+        if made.is_file() and any(entry.holds(run) for entry in entries):
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(made, copy)
+
+
+def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]:
+    """Write those entries of a study all of whose recordings are kept, and remove the recordings; return which.
+
+    An entry says of itself what the one before it said, but for the commit and the processors. It is replayed. What
+    was found of when the episodes of the one before were lost is removed.
+
+    Args:
+        commit: that has the entry's rows.
+
+    Raises:
+        InputError: the runs do not belong together, as those of different makes of processors, or end otherwise.
+    """
+    own = {name: entry for name, entry in ENTRIES.items() if entry.study == study}
+    written = [name for name, entry in own.items() if entry.is_whole(folder)]
+    for name in written:
+        root = board / "entries" / name
+        with TemporaryDirectory(dir=board) as scratch:
+            _write(own[name], folder, read_submission(root).declaration, commit, Path(scratch) / name)
+            shutil.rmtree(root)
+            (Path(scratch) / name).rename(root)
+        (board / "recovered" / f"{name}.parquet").unlink(missing_ok=True)
+        say(verify(VerifyConfig(root, record=board / "verified")))
+    waiting = {run for name in own.keys() - {*written} for run in own[name].rows(folder)["run"].dropna()}
+    for path in (folder / KEPT).glob("runs/*"):
+        if written and path.name not in waiting:
+            shutil.rmtree(path)
+    return written
+
+
+def _write(entry: Entry, folder: Path, before: Declaration, commit: str, root: Path) -> None:
+    rows, settings = entry.rows(folder), before.settings
+    processors = sorted({json.loads(versions)["processor"] for versions in rows["versions"].dropna()})
+    said = {
+        "revision": f"study {entry.study} of results/{entry.study}, variant {entry.variant}, commit {commit}",
+        "compute": f"2 cores of {' and '.join(processors)}, no GPU",
+    }
+    about = from_recordings.with_draws(replace(before.about, **said), folder)
+    recorded = from_recordings.recorded_by_study(folder, folder / KEPT, entry.variant, settings, entry.settings)
+    made = from_recordings.trained_by_study(folder, entry.variant, settings, entry.settings)
+    from_recordings.submit(root, about, before.suite, settings, *recorded, made)
