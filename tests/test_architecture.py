@@ -49,7 +49,7 @@ ARROWS = {
     "features.trainer": ("artifacts", "policies", "training"),
     "rollout": ("contract",),
     "rollout.agents": ("contract", "policy_types"),
-    "rollout.lockstep": ("contract", "envs", "perturbations", "plans"),
+    "rollout.lockstep": ("artifacts.pools", "contract", "envs", "perturbations", "plans"),
     "rollout.references": ("contract", "demos"),
     "rollout.simulators": ("artifacts", "envs"),
     "training": ("artifacts",),
