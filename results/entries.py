@@ -19,6 +19,7 @@ from lerobot_constructskill.board.declaration import Declaration
 from lerobot_constructskill.board.protocol import LEVEL, PERTURBED_AXES
 from lerobot_constructskill.board.submission import read_submission
 from lerobot_constructskill.envs.recording import RECORDINGS
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.scripts.console import say
 from lerobot_constructskill.scripts.verify import VerifyConfig, verify
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
@@ -76,42 +77,61 @@ def kept(folder: Path, run: str) -> Path:
 
 
 def keep(folder: Path, study: str, runs: Iterable[Run], store: Store) -> None:
-    """Copy to a study's folder what runs executed of which an entry is made."""
-    entries = [entry for entry in ENTRIES.values() if entry.study == study]
+    """Copy to a study's folder what runs executed of which an entry is made; what older runs executed goes."""
+    own = of(study)
     for run in runs:
         made, copy = store.folder(run) / RECORDINGS, kept(folder, run.digest)
-        if made.is_file() and any(entry.holds(run) for entry in entries):
+        if made.is_file() and any(entry.holds(run) for entry in own.values()):
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(made, copy)
+    _remove_others(folder, own.values())
+
+
+def of(study: str) -> dict[str, Entry]:
+    """The entries that are made of a study, by name."""
+    return {name: entry for name, entry in ENTRIES.items() if entry.study == study}
+
+
+def whole(folder: Path, study: str) -> list[str]:
+    """The entries of a study that can be written."""
+    return [name for name, entry in of(study).items() if entry.is_whole(folder)]
 
 
 def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]:
-    """Write those entries of a study all of whose recordings are kept, and remove the recordings; return which.
+    """Write the entries of a study that can be written, and remove their recordings; return which were.
 
     An entry says of itself what the one before it said, but for the commit and the processors. It is replayed. What
-    was found of when the episodes of the one before were lost is removed.
+    was found of when the episodes of the one before were lost is removed. One that is refused, as its runs are of
+    different makes of processors or end otherwise, stays as it was, and the reason is printed.
 
     Args:
         commit: that has the entry's rows.
-
-    Raises:
-        InputError: the runs do not belong together, as those of different makes of processors, or end otherwise.
     """
-    own = {name: entry for name, entry in ENTRIES.items() if entry.study == study}
-    written = [name for name, entry in own.items() if entry.is_whole(folder)]
-    for name in written:
+    own, written = of(study), []
+    for name in whole(folder, study):
         root = board / "entries" / name
         with TemporaryDirectory(dir=board) as scratch:
-            _write(own[name], folder, read_submission(root).declaration, commit, Path(scratch) / name)
+            made = Path(scratch) / name
+            try:
+                _write(own[name], folder, read_submission(root).declaration, commit, made)
+                say(verify(VerifyConfig(made, record=board / "verified")))
+            except InputError as error:
+                say(f"No new entry {name}: {error}")
+                continue
             shutil.rmtree(root)
-            (Path(scratch) / name).rename(root)
+            made.rename(root)
         (board / "recovered" / f"{name}.parquet").unlink(missing_ok=True)
-        say(verify(VerifyConfig(root, record=board / "verified")))
-    waiting = {run for name in own.keys() - {*written} for run in own[name].rows(folder)["run"].dropna()}
-    for path in (folder / KEPT).glob("runs/*"):
-        if written and path.name not in waiting:
-            shutil.rmtree(path)
+        written.append(name)
+    _remove_others(folder, [own[name] for name in own.keys() - {*written}])
     return written
+
+
+def _remove_others(folder: Path, entries: Iterable[Entry]) -> None:
+    """Remove the recordings of runs that are in none of some entries."""
+    needed = {run for entry in entries for run in entry.rows(folder)["run"].dropna()}
+    for path in (folder / KEPT).glob("runs/*"):
+        if path.name not in needed:
+            shutil.rmtree(path)
 
 
 def _write(entry: Entry, folder: Path, before: Declaration, commit: str, root: Path) -> None:

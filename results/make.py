@@ -20,7 +20,7 @@ from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
-from entries import keep, write_whole
+from entries import keep, whole, write_whole
 from render import PAGES, render
 
 from lerobot_constructskill.artifacts.folders import write_text
@@ -161,7 +161,8 @@ class Maker:
 
     def is_committed(self, piece: Piece) -> bool:
         """Whether nothing of its study waits for a commit, as it does where a process was killed before that."""
-        return not self._git("status", "--porcelain", "--", self.folder(piece.study))
+        folder = self.folder(piece.study)
+        return not self._git("status", "--porcelain", "--", folder) and not whole(folder, piece.study)
 
     def make(self, piece: Piece) -> None:
         """Make what is missing of a piece, write its pages and commit them.
@@ -187,9 +188,6 @@ class Maker:
         """Write the report of a piece's study and the numbers in pages, and commit them with its rows.
 
         Then write the entries of the board that it was the last piece of, and commit these.
-
-        Raises:
-            InputError: an entry cannot be made of its runs. Everything else is committed.
         """
         report(ReportConfig(self.folder(piece.study)))
         for page in self._pages:

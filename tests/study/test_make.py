@@ -200,7 +200,7 @@ def test_every_study_that_the_benchmark_stands_on_has_a_folder_and_no_other_has(
 
 
 def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_the_others_were(
-    checkout, tmp_path, made, monkeypatch
+    checkout, tmp_path, made, monkeypatch, capsys
 ):
     """Its replay, which has tests of its own, is left out: these episodes were never run."""
     import entries
@@ -220,15 +220,30 @@ def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_t
     monkeypatch.setattr(entries, "ENTRIES", {"mine": entries.Entry("tiny", "a", ("one", "two"))})
     monkeypatch.setattr(entries, "verify", lambda config: replayed.append(config.root) or "it holds")
     maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    stale = checkout / "results/tiny/recordings/runs/of_older_code" / RECORDINGS
+    stale.parent.mkdir(parents=True)
+    stale.touch()
     maker.make(maker.pieces("tiny/two")[0])
     there = git(checkout, "ls-files", "results/tiny/recordings").split()
     assert len(there) == 2 and not replayed and read_submission(checkout / "board/entries/mine").claims[0].key[1] == 3
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
     elsewhere = made.Maker(clone, tmp_path / "another_store", ["tiny"])
-    elsewhere.make(elsewhere.pieces("tiny/one")[0])
+    (last,) = elsewhere.pieces("tiny/one")[:1]
+
+    def refuse(config):
+        raise InputError("seed 3 ends otherwise")
+
+    with monkeypatch.context() as refused:
+        refused.setattr(entries, "verify", refuse)
+        elsewhere.make(last)
+    assert "No new entry mine: seed 3 ends otherwise" in capsys.readouterr().out
+    assert git(clone, "log", "-1", "--format=%s") == "Results: tiny/one\n" and not git(clone, "status", "--porcelain")
+    assert len(git(clone, "ls-files", "results/tiny/recordings").split()) == 4 and not elsewhere.is_committed(last)
+    elsewhere.publish(last)  # as the next command does
+    assert elsewhere.is_committed(last)
     entry = read_submission(clone / "board/entries/mine")
-    assert replayed == [clone / "board/entries/mine"] and git(clone, "log", "-1", "--format=%s") == "Board: mine\n"
+    assert [root.name for root in replayed] == ["mine"] and git(clone, "log", "-1", "--format=%s") == "Board: mine\n"
     assert {claim.key for claim in entry.claims} == {
         (name, seed, start) for name in ("one", "two") for seed in (0, 1) for start in (1000, 1001)
     }
