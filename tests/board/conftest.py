@@ -4,12 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from forge import SEEING
 
 from lerobot_constructskill.board.protocol import BoardSetting
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 
 ENTRIES = Path(__file__).parents[2] / "board" / "entries"
-SEEING = "physx_cpu, sapien_cpu rendering"
 SETTINGS = {task: BoardSetting(task, episodes=2) for task in ("brick_to_bin_shifted", "block_to_bin")}
 
 

@@ -19,6 +19,9 @@ from lerobot_constructskill.perturbations import PICTURES
 
 type Forge = Callable[[Path, np.random.Generator], None]
 
+SEEING = "physx_cpu, sapien_cpu rendering"
+"""A backend that shows pictures."""
+
 READ: dict[str, Forge] = {}
 REPLAYED: dict[str, Forge] = {}
 

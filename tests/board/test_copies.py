@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import SEEING
-from forge import declare, edit
+from forge import SEEING, declare, edit
 
 from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.entries import check_original, read_entries
