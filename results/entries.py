@@ -29,8 +29,8 @@ KEPT = "recordings"
 
 
 @dataclass(frozen=True)
-class Entry:
-    """An entry that is a variant of a study in some of its settings."""
+class Part:
+    """What an entry is made of: a variant of a study in some of its settings."""
 
     study: str
     variant: str
@@ -60,20 +60,20 @@ LADDER = tuple(f"brick_to_bin_{clearance}mm" for clearance in (40, 20, 10, 5, 3)
 PERTURBED = ("control", *(f"{axis}_{LEVEL}" for axis in PERTURBED_AXES))
 
 ENTRIES = {
-    "joints_precise": Entry("precise", "precise", JOINTS),
-    "ladder_precise": Entry("precise", "precise", LADDER),
-    "precise_turned": Entry("precise", "more", ("brick_to_bin_turned",)),
-    "precise_shifted": Entry("perturbed", "precise", ("control",)),
-    "precise_perturbed": Entry("perturbed", "precise", PERTURBED),
-    "act_shifted": Entry("other_policies", "act", ("shifted",)),
-    "diffusion_shifted": Entry("other_policies", "diffusion", ("shifted",)),
+    "joints_precise": Part("precise", "precise", JOINTS),
+    "ladder_precise": Part("precise", "precise", LADDER),
+    "precise_turned": Part("precise", "more", ("brick_to_bin_turned",)),
+    "precise_shifted": Part("perturbed", "precise", ("control",)),
+    "precise_perturbed": Part("perturbed", "precise", PERTURBED),
+    "act_shifted": Part("other_policies", "act", ("shifted",)),
+    "diffusion_shifted": Part("other_policies", "diffusion", ("shifted",)),
 }
 """Folder in `board/entries` to what it is made of."""
 
 
 def kept(folder: Path, run: str) -> Path:
     """Where a study's folder keeps what a run executed: laid out as a store is."""
-    return folder / KEPT / "runs" / run / RECORDINGS
+    return folder / KEPT / Run.kind / run / RECORDINGS
 
 
 def keep(folder: Path, study: str, runs: Iterable[Run], store: Store) -> None:
@@ -87,7 +87,7 @@ def keep(folder: Path, study: str, runs: Iterable[Run], store: Store) -> None:
     _remove_others(folder, own.values())
 
 
-def of(study: str) -> dict[str, Entry]:
+def of(study: str) -> dict[str, Part]:
     """The entries that are made of a study, by name."""
     return {name: entry for name, entry in ENTRIES.items() if entry.study == study}
 
@@ -126,15 +126,15 @@ def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]
     return written
 
 
-def _remove_others(folder: Path, entries: Iterable[Entry]) -> None:
+def _remove_others(folder: Path, entries: Iterable[Part]) -> None:
     """Remove the recordings of runs that are in none of some entries."""
     needed = {run for entry in entries for run in entry.rows(folder)["run"].dropna()}
-    for path in (folder / KEPT).glob("runs/*"):
+    for path in (folder / KEPT / Run.kind).glob("*"):
         if path.name not in needed:
             shutil.rmtree(path)
 
 
-def _write(entry: Entry, folder: Path, before: Declaration, commit: str, root: Path) -> None:
+def _write(entry: Part, folder: Path, before: Declaration, commit: str, root: Path) -> None:
     rows, settings = entry.rows(folder), before.settings
     processors = sorted({json.loads(versions)["processor"] for versions in rows["versions"].dropna()})
     said = {

@@ -1,7 +1,8 @@
 """Makes the published results, a piece of a study at a time: `make results`.
 
 A piece is a setting of a study, or one draw of it. Its rows, times, report and the numbers in pages are committed
-before the next one begins, so that a killed run, or a clone on another machine, makes only what is left.
+before the next one begins, so that a killed run, or a clone on another machine, makes only what is left. The board's
+entries that are made of studies (`entries.py`) are written and committed with their last piece.
 
     python results/make.py --status            # what is left, and how long it takes as far as that is known
     python results/make.py --only=precise      # the pieces whose names fit, or begin so
@@ -160,7 +161,7 @@ class Maker:
         return tell_time(runs, mean | took)
 
     def is_committed(self, piece: Piece) -> bool:
-        """Whether nothing of its study waits for a commit, as it does where a process was killed before that."""
+        """Whether no rows and no entry of its study wait for a commit, as where a process was killed before that."""
         folder = self.folder(piece.study)
         return not self._git("status", "--porcelain", "--", folder) and not whole(folder, piece.study)
 

@@ -77,15 +77,13 @@ def roll_out(
         for number, (agent, own) in enumerate(zip(agents, seeds, strict=True))
         for lane in _lanes_of(number, agent, own, env_kwargs, number in filmed, n_workers)
     ]
-    on_lanes_step = on_step and _as_of_agents(on_step, lanes)
     with (
         simulators([lane.env for lane in lanes], n_workers) as sims,
         Progress(total=sum(map(len, seeds)), unit="episode", desc="rollout") as bar,
     ):
         shared = Lockstep([lane.agent for lane in lanes])
         groups = [
-            _Together(numbers, lanes, shared, env_kwargs, sims, on_lanes_step)
-            for numbers in _halves(range(len(lanes)))
+            _Together(numbers, lanes, shared, env_kwargs, sims, on_step) for numbers in _halves(range(len(lanes)))
         ]
         over: dict[int, dict[int, Rollout]] = {number: {} for number in range(len(agents))}  # by agent and lane
         bar.unpause()  # until now the simulators started
@@ -132,11 +130,6 @@ def _lanes_of(
     shares = [*batched(range(1, len(seeds)), ceil((len(seeds) - 1) / n_workers))]  # noqa: B911  the last may be shorter
     others = [_Lane(number, deepcopy(agent), share[0], seeds[share[0] : share[-1] + 1], unseen) for share in shares]
     return [_Lane(number, agent, 0, seeds[:1], env), *others]
-
-
-def _as_of_agents(on_step: OnStep, lanes: Sequence[_Lane]) -> OnStep:
-    """`on_step` as it is called with a lane's number in place of the agent's."""
-    return lambda i, episode, action, step: on_step(lanes[i].number, lanes[i].first + episode, action, step)
 
 
 def _joined(rollouts: Sequence[Rollout]) -> Rollout:
@@ -207,7 +200,8 @@ class _Together:
         if step.done and self.plan:
             episodes[-1].measures = measured(self.plan, step.sim)
         if self.on_step:
-            self.on_step(i, len(episodes) - 1, action, step)
+            lane = self.lanes[i]
+            self.on_step(lane.number, lane.first + len(episodes) - 1, action, step)
 
     def _start(self, numbers: Sequence[int]) -> Answers:
         """Begin the next episode of these lanes."""

@@ -340,3 +340,14 @@ def test_openvino_reports_nothing_over_the_network(tmp_path):
     surroundings = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])}
     run = subprocess.run([sys.executable, "-c", code], env=surroundings, capture_output=True, text=True)
     assert run.stdout.strip() == "openvino.tools.ovc.telemetry_stub", run.stderr
+
+
+@pytest.mark.skipif(importlib.util.find_spec("wandb") is None, reason="there is no wandb to leave out")
+def test_timm_comes_without_wandb_which_can_be_imported_afterwards():
+    """In a process of its own: both are imported once."""
+    code = (
+        "import sys; from lerobot_constructskill.policies.frozen_vit.weights import import_timm as come; "
+        "timm = come(); assert timm is sys.modules['timm'] and 'wandb' not in sys.modules; "
+        "import wandb; assert come() is timm"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

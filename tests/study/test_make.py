@@ -217,7 +217,7 @@ def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_t
     git(checkout, "add", "board")
     git(checkout, "commit", "--quiet", "--message=an entry")
     replayed = []
-    monkeypatch.setattr(entries, "ENTRIES", {"mine": entries.Entry("tiny", "a", ("one", "two"))})
+    monkeypatch.setattr(entries, "ENTRIES", {"mine": entries.Part("tiny", "a", ("one", "two"))})
     monkeypatch.setattr(entries, "verify", lambda config: replayed.append(config.root) or "it holds")
     maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
     stale = checkout / "results/tiny/recordings/runs/of_older_code" / RECORDINGS
