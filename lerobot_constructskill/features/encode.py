@@ -199,7 +199,7 @@ def _part(parts: Path, episode: dict) -> Path:
 
 def _encode(encoder: FrozenEncoder, images: Tensor, with_patches: bool) -> tuple[np.ndarray, np.ndarray | None]:
     pooled, tokens = encoder.encode(images.to(encoder.device) / 255)
-    return pooled.cpu().numpy(), tokens.cpu().numpy().astype(np.float16) if with_patches else None
+    return pooled.cpu().numpy(), tokens.half().cpu().numpy() if with_patches else None
 
 
 def _write_copy(
