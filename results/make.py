@@ -4,7 +4,7 @@ A piece is a setting of a study, or one draw of it. Its rows, times, report and 
 before the next one begins, so that a killed run, or a clone on another machine, makes only what is left. The board's
 entries that are made of studies (`entries.py`) are written and committed with their last piece.
 
-    python results/make.py --status            # what is left, and how long it takes as far as that is known
+    python results/make.py --status            # what is left, and roughly how long it takes
     python results/make.py --only=precise      # the pieces whose names fit, or begin so
     python results/make.py --minutes=120       # begin no piece after so long
     python results/make.py --executor=ray      # the runs of a piece on a cluster
@@ -23,6 +23,7 @@ from pathlib import Path
 
 from entries import keep, whole, write_whole
 from render import PAGES, render
+from times import Times
 
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.store import Node, Store
@@ -38,9 +39,7 @@ from lerobot_constructskill.study.rows import Draws
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
-from lerobot_constructskill.study.status import tell_time
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import seconds_per_run
 
 ROOT = Path(__file__).parents[1]
 
@@ -150,15 +149,16 @@ class Maker:
 
     def status(self, pieces: Sequence[Piece]) -> str:
         """A line for each piece that is to be made, and their number."""
+        times = self.times()
         due = [(piece, runs) for piece, runs in self.due(pieces) if runs]
-        lines = [f"{piece.name}: {plural(len(runs), 'run')}, {self.time(piece, runs)}" for piece, runs in due]
-        return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made"])
+        lines = [f"{piece.name}: {plural(len(runs), 'run')}, {times.tell(piece.study, runs)}" for piece, runs in due]
+        left = f"; the others: {times.total()}" if due else ""
+        return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made{left}"])
 
-    def time(self, piece: Piece, runs: Sequence[Run]) -> str:
-        """How long runs take, by those of their study that were made: of the same variant, else by the mean."""
-        took = seconds_per_run(self.folder(piece.study))
-        mean = {run.arm.id: sum(took.values()) / len(took) for run in runs} if took else {}
-        return tell_time(runs, mean | took)
+    def times(self) -> Times:
+        """How long runs take, by what is in the folders of all studies now."""
+        folders = {study: self.folder(study) for study in self.configs}
+        return Times(folders, {name: config.study.episodes for name, config in self.configs.items()}, self.store)
 
     def is_committed(self, piece: Piece) -> bool:
         """Whether no rows and no entry of its study wait for a commit, as where a process was killed before that."""
@@ -260,7 +260,7 @@ def main() -> None:
             if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
                 say(f"Stopped before {piece.name}; the same command continues there")
                 return
-            say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.time(piece, runs)}")
+            say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}")
             maker.make(piece)
             if asked.discard:
                 maker.discard(piece)

@@ -1,7 +1,7 @@
 """Writes the numbers of result tables in pages from the rows of studies: `python results/render.py`.
 
 A row of a table with a link to a report, whose title names an arm (setting/variant), has its numbers from there, each
-column by its head (`HEADS`). A link whose title begins with one of `WORDS`, or with seed_N, has that number as its text:
+column by its head (`HEADS`). A link whose title begins with one of `WORDS`, or seed_N, has that number as its text:
 
     | finer maps | 489/500 | 68 to 99 | [precise](results/precise/report.md "brick_to_bin_shifted/precise") |
     | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |

@@ -80,10 +80,14 @@ def tell_time(runs: Sequence[Run], took: Mapping[str, float]) -> str:
     known = [took[run.arm.id] for run in runs if run.arm.id in took]
     if not known:
         return "time unknown"
-    seconds, more = sum(known), " and some of unknown time" if len(known) < len(runs) else ""
+    return tell_seconds(sum(known)) + (" and some of unknown time" if len(known) < len(runs) else "")
+
+
+def tell_seconds(seconds: float) -> str:
+    """A time in the unit that suits it."""
     units = ((3600, "h"), (60, "min"), (1, "s"))
     size, unit = next(one for one in units if seconds >= 1.5 * one[0] or one[0] == 1)
-    return f"about {seconds / size:.0f} {unit}{more}"
+    return f"about {seconds / size:.0f} {unit}"
 
 
 def _total(table: Table, due: Sequence[Run], took: Mapping[str, float]) -> str:

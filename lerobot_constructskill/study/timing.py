@@ -68,7 +68,7 @@ def timed(root: Path, arm: str, stage: str, runs: int) -> Iterator[None]:
 def seconds_per_run(root: Path) -> dict[str, float]:
     """What a run of each arm took, trained and evaluated, the last time that some were made."""
     last: dict[str, dict[str, float]] = defaultdict(dict)
-    for entry in _entries(root):
+    for entry in entries(root):
         if entry["stage"] in OF_A_RUN:
             last[entry["arm"]][entry["stage"]] = entry["seconds"] / entry["runs"]
     return {arm: sum(took.values()) for arm, took in last.items() if "evaluation" in took}
@@ -78,13 +78,14 @@ def time_by_stage(root: Path) -> list[Took]:
     """What each stage of a study took in all, in the order of `STAGES`."""
     runs: dict[str, int] = defaultdict(int)
     seconds: dict[str, float] = defaultdict(float)
-    for entry in _entries(root):
+    for entry in entries(root):
         runs[entry["stage"]] += entry["runs"]
         seconds[entry["stage"]] += entry["seconds"]
     return [Took(stage, runs[stage], seconds[stage]) for stage in STAGES if stage in runs]
 
 
-def _entries(root: Path) -> Iterator[_Entry]:
+def entries(root: Path) -> Iterator[_Entry]:
+    """The lines of a study's file, in their order."""
     file = root / TIMINGS
     for line in read_bytes(file).splitlines() if file.exists() else []:
         with suppress(ValueError):  # a line that a full disk or a power cut tore, or of another version

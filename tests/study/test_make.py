@@ -20,6 +20,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study import session
 from lerobot_constructskill.study.rows import ROWS, EpisodeRow, load_rows, write_rows
 from lerobot_constructskill.study.runs import EPISODES
+from lerobot_constructskill.study.timing import TIMINGS
 
 ROOT = Path(__file__).parents[2]
 
@@ -108,6 +109,22 @@ def recorded(length, seed):
     return episodes
 
 
+def test_what_pieces_share_is_counted_with_the_first(checkout, tmp_path, made):
+    """Two seeds of `a` learn from one set; `no_op` and `a` have two episodes each in both settings."""
+    seconds = {"demonstrations": 100, "data": 20, "training": 60}  # of the set; of two seeds
+    took = [{"arm": "one/a", "stage": stage, "runs": 2, "seconds": number} for stage, number in seconds.items()]
+    took += [{"arm": "one/a", "stage": "evaluation", "runs": 2, "seconds": 8}]
+    took += [{"arm": "one/no_op", "stage": "evaluation", "runs": 1, "seconds": 3}]
+    (checkout / "results/tiny" / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in took))
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    assert maker.status(maker.pieces()).splitlines() == [
+        "tiny/one: 3 runs, about 3 min",  # 191 s
+        "tiny/one/act: 1 run, time unknown",
+        "tiny/two: 3 runs, about 11 s",
+        "0 of 3 pieces made; the others: about 3 min, and 1 piece of unknown time",
+    ]
+
+
 def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkout, tmp_path, made):
     maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
     pieces = {piece.name: len(piece.runs) for piece in maker.pieces()}
@@ -119,7 +136,7 @@ def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkou
     assert maker.status(maker.pieces()).splitlines() == [
         "tiny/one: 3 runs, time unknown",
         "tiny/one/act: 1 run, time unknown",
-        "1 of 3 pieces made",
+        "1 of 3 pieces made; the others: 2 pieces of unknown time",
     ]
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
