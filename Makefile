@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo ten-seeds results check test nightly mutants bench dist docs image pins
+.PHONY: help setup demo ten-seeds results check test nightly mutants bench dist docs release image pins
 
 # Each package is compiled once, also where a container says otherwise: else every process compiles LeRobot anew.
 export PYTHONDONTWRITEBYTECODE :=
@@ -65,6 +65,9 @@ image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BA
 
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
+
+release: dist docs ## wheel and source distribution, site with the board, and what goes to the Hub (HUB=user; PUSH=1 uploads)
+	.venv/bin/python results/release.py --user=$(or $(HUB),user) $(if $(PUSH),--push)
 
 pins: ## resolve pyproject.toml afresh into constraints.txt, for x86-64 Linux and Python 3.12
 	PATH="$$PWD/.venv-uv/bin:$$PATH" uv pip compile pyproject.toml --quiet --upgrade --all-extras --python-version 3.12 \
