@@ -255,16 +255,20 @@ def test_a_killed_run_of_two_workers_continues_to_the_bytes_of_an_undisturbed_on
 
 
 @pytest.mark.nightly
-def test_a_set_of_two_tasks_has_the_same_bytes_with_two_workers_and_after_a_kill(tmp_path):
-    flags = ["--task=brick_to_bin_40mm,brick_to_bin_turned", "--action=full", "--episodes=2", "--annotate=true"]
+@pytest.mark.parametrize("executor", ["processes", "ray"])
+def test_a_set_with_a_wall_has_the_same_bytes_with_two_workers_and_after_a_kill(tmp_path, executor):
+    if executor == "ray":
+        pytest.importorskip("ray", reason="the extra `distributed` brings it")
+    flags = ["--task=course_of_three,brick_to_bin_turned", "--action=full", "--episodes=2", "--annotate=true"]
     _, stderr = (whole := generate(tmp_path / "whole", *flags)).communicate()
     assert whole.returncode == 0, stderr
     killed = generate(tmp_path / "set", *flags, "--workers=2")
     wait_for(tmp_path, "set.partial/shards/*/*/attempt.json", killed)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
-    _, stderr = (resumed := generate(tmp_path / "set", *flags, "--workers=2")).communicate()
-    assert resumed.returncode == 0, stderr
+    again = generate(tmp_path / "set", *flags, "--workers=2", f"--executor={executor}")
+    _, stderr = again.communicate()
+    assert again.returncode == 0, stderr
     assert hashes(tmp_path / "set") == hashes(tmp_path / "whole")
     data = open_dataset(tmp_path / "set")
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
