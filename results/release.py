@@ -1,36 +1,43 @@
-"""Puts on the Hub what a release has there: data sets, checkpoints, and the site with the board, each with its page.
+"""What a release has on the Hub: data sets, checkpoints, and the site with the board, each with its page.
 
-    python results/release.py --user=NAME           # writes all of it to outputs/hub, for you to look at
-    python results/release.py --user=NAME --push    # uploads it; interrupted, the same command continues
+    python results/release.py --user=NAME    # writes all of it to outputs/hub, for you to look at
+    python results/release.py --push         # uploads what lies there; interrupted, the same command continues
 
-`make release` does the first, after the wheel, the source distribution and the site. A data set is generated where it
-is not there yet; checkpoints are those of `make results` in the store.
+`make release HUB=NAME` does the first, after the wheel, the source distribution and the site. Data sets and
+checkpoints come from the store of `make results`. What it lacks is made: minutes for a set, half an hour for the
+checkpoints.
 """
 
+import json
 import shutil
 from argparse import RawDescriptionHelpFormatter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypedDict
 
+import pandas as pd
 from huggingface_hub import HfApi
 
 from lerobot_constructskill.analysis.stats.outcomes import runs_of
-from lerobot_constructskill.artifacts.folders import write_text
-from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.artifacts.digests import file_sha256
+from lerobot_constructskill.artifacts.folders import staged, write_text
+from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.dataset.hub import hub_errors
+from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import MissingError
+from lerobot_constructskill.errors import InputError, MissingError, TakenError
+from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.console import Parser, edge, say
 from lerobot_constructskill.scripts.dataset import CardConfig, PushConfig, push_dataset, write_card
-from lerobot_constructskill.scripts.generate import generate
-from lerobot_constructskill.scripts.push_policy import OBJECT, render_card
+from lerobot_constructskill.scripts.push_policy import OBJECT, PUSHED, render_card
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import ROWS, read_rows
+from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.training.checkpoints import checkpoint_of
 
 ROOT = Path(__file__).parents[1]
@@ -38,8 +45,8 @@ ROOT = Path(__file__).parents[1]
 SETS = ("paper", "fast", "precise/brick_to_bin_shifted", "suite/orders")
 """Data sets, as `constructskill-generate` calls them."""
 
-POLICIES = {("precise", "brick_to_bin_shifted/precise"): "precise/brick_to_bin_shifted"}
-"""Study and arm whose checkpoints are uploaded, a repository a training seed, to the set that they learned from."""
+POLICIES = {"precise/brick_to_bin_shifted": ("precise", "brick_to_bin_shifted/precise")}
+"""Data set to the study and arm that learned from it, each of whose training seeds has a repository."""
 
 SPACE = """---
 title: ConstructSkill
@@ -48,8 +55,16 @@ app_file: index.html
 license: apache-2.0
 ---
 
-The documentation of ConstructSkill, and its leaderboard: every entry's recorded actions were executed again.
+The documentation of ConstructSkill, and its leaderboard.
 """
+
+FILE = "release.json"
+"""Beside the repositories: whose they are, and the tag of the version."""
+
+
+class _Release(TypedDict):
+    user: str
+    tag: str
 
 
 def called(name: str) -> str:
@@ -57,104 +72,127 @@ def called(name: str) -> str:
     return "constructskill_" + name.replace("/", "_")
 
 
-class Release:
-    """What goes to the Hub, in a folder: `datasets`, `models` and `spaces`, with a folder for each repository.
+def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> None:
+    """Write `datasets`, `models` and `spaces`, with a folder for each repository, to a folder that appears whole.
 
     Args:
+        out: the folder; an earlier release in it goes.
         user: whose repositories they are.
-        out: the folder.
-        store: where `make results` made checkpoints.
-        site: where `make docs` built it.
+        store: where `make results` works.
+        site: where `make docs` built the site.
+
+    Raises:
+        MissingError: the site was not built.
+        TakenError: something else is in the way.
+        InputError: a checkpoint is not the one that the published rows are of.
     """
+    if not (site / "index.html").is_file():
+        raise MissingError(f"{site} has no index.html: `make docs` builds the site.")
+    if (out / FILE).is_file():
+        shutil.rmtree(out)
+    release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}")
+    sets = {
+        name: Demonstrations(parse_named(GenerateConfig, "generate", name, ["--repo_id=local/set"])) for name in SETS
+    }
+    runs = {data: _runs(study, arm) for data, (study, arm) in POLICIES.items()}
+    sets |= {data: own[0].arm.demonstrations.node for data, own in runs.items()}
+    with staged(out) as folder:
+        for name, node in sets.items():
+            root = folder / "datasets" / called(name)
+            shutil.copytree(store.get(node, machine), root)
+            write_card(CardConfig(root, f"{user}/{root.name}"))
+        for data, own in runs.items():
+            for run, checkpoint in _checkpoints(POLICIES[data][0], own, store, machine):
+                root = folder / "models" / f"{called(POLICIES[data][0])}_{run.id.replace('/', '_')}"
+                shutil.copytree(checkpoint, root)
+                learned = {"repo_id": f"{user}/{called(data)}", "revision": release["tag"]}
+                write_text(
+                    root / "README.md", _card(f"{user}/{root.name}", POLICIES[data][0], run, checkpoint, learned)
+                )
+        shutil.copytree(site, folder / "spaces" / "constructskill")
+        write_text(folder / "spaces" / "constructskill" / "README.md", SPACE)
+        write_text(folder / FILE, json.dumps(release) + "\n")
 
-    def __init__(self, user: str, out: Path, store: Store, site: Path):
-        self.user, self.out, self.store, self.site = user, out, store, site
-        self.tag = f"v{version('lerobot_env_constructskill')}"
 
-    def write(self) -> None:
-        """Write data sets that are not there yet, and all else anew.
+def _runs(study: str, arm: str) -> list[Run]:
+    return [run for run in list_runs(parse(StudyConfig, [], find("study", study)).study) if run.arm.id == arm]
 
-        Raises:
-            MissingError: the site was not built.
-        """
-        if not (self.site / "index.html").is_file():
-            raise MissingError(f"{self.site} has no index.html: `make docs` builds the site.")
-        for name in SETS:
-            root = self.out / "datasets" / called(name)
-            if not root.exists():
-                flags = [f"--repo_id={self._repo(root)}", f"--root={root}"]
-                say(generate(parse_named(GenerateConfig, "generate", name, flags)))
-            say(write_card(CardConfig(root, self._repo(root))))
-        for (study, arm), data in POLICIES.items():
-            for line in self._checkpoints(study, arm, data):
-                say(line)
-        self._copy(self.site, self.out / "spaces" / "constructskill", SPACE)
 
-    def push(self) -> None:
-        """Upload everything that is in the folder.
+def _rows(study: str, run: Run) -> pd.DataFrame:
+    """The published rows of a run's arm."""
+    rows = read_rows(ROOT / "results" / study / ROWS)
+    return rows[(rows["setting"] == run.arm.setting) & (rows["variant"] == run.arm.name)]
 
-        Raises:
-            InputError: a check found something wrong with a data set.
-            OSError: the Hub refused, or the connection broke.
-        """
-        for root in sorted(self.out.glob("datasets/*")):
-            say(push_dataset(PushConfig(self._repo(root), root, tag=self.tag, update=True)))
-        api = HfApi()
-        for kind, options in (("model", {}), ("space", {"space_sdk": "static"})):
-            for root in sorted(self.out.glob(f"{kind}s/*")):
-                with hub_errors(self._repo(root)):
-                    api.create_repo(self._repo(root), repo_type=kind, exist_ok=True, **options)
-                    api.upload_folder(repo_id=self._repo(root), repo_type=kind, folder_path=root, delete_patterns="*")
-                say(f"Pushed: {self._repo(root)}")
 
-    def _repo(self, folder: Path) -> str:
-        return f"{self.user}/{folder.name}"
-
-    def _checkpoints(self, study: str, arm: str, data: str) -> Iterator[str]:
-        """Copy the checkpoints that the store has of an arm; each card tells of all seeds. Yield which are lacking."""
-        rows = read_rows(ROOT / "results" / study / ROWS)
-        own = runs_of(rows[rows["setting"] + "/" + rows["variant"] == arm])
-        outcomes = [*own[["training_seed", "lifted", "placed", "episodes"]].itertuples(index=False, name=None)]
-        runs = [run for run in list_runs(parse(StudyConfig, [], find("study", study)).study) if run.arm.id == arm]
-        made = [run for run in runs if self.store.has(run.checkpoints)]
-        for run in made:
-            source = checkpoint_of(run.seed, self.store.folder(run.checkpoints))
-            target = self.out / "models" / f"{called(study)}_{arm.replace('/', '_')}_seed_{run.seed}"
-            policy, record = OBJECT.read(source / "config.json"), source / "encoder.json"
-            learned = {"repo_id": f"{self.user}/{called(data)}", "revision": self.tag}
-            train = {"seed": run.seed, "dataset": learned}
-            encoder = OBJECT.read(record) if record.is_file() else {}
-            card = render_card(self._repo(target), outcomes, run.arm.env["task"], train, policy, encoder)
-            self._copy(source, target, card)
-        if len(made) < len(runs):
-            setting = arm.split("/")[0]
-            yield (
-                f"{len(runs) - len(made)} of {len(runs)} checkpoints of {study}/{arm} are not in {self.store.root}: "
-                f"`python results/make.py --only={study}/{setting}` makes them."
+def _checkpoints(study: str, runs: Sequence[Run], store: Store, machine: Machine) -> Iterator[tuple[Run, Path]]:
+    """Each run's checkpoint. Raises InputError if one is not the one that the published rows are of."""
+    published = _rows(study, runs[0]).drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
+    for run in runs:
+        checkpoint = checkpoint_of(run.seed, store.get(run.checkpoints, machine))
+        if file_sha256(checkpoint / "model.safetensors") != published[run.seed]:
+            raise InputError(
+                f"The weights of {study}/{run.id} here are not those of the published rows: release on the kind of "
+                f"processor that made {study}/{run.arm.setting}, after `make results`."
             )
+        yield run, checkpoint
 
-    @staticmethod
-    def _copy(source: Path, target: Path, page: str) -> None:
-        shutil.rmtree(target, ignore_errors=True)
-        shutil.copytree(source, target)
-        write_text(target / "README.md", page)
-        say(f"{source} copied to {target}")
+
+def _card(repo_id: str, study: str, run: Run, checkpoint: Path, learned: dict[str, str]) -> str:
+    """A checkpoint's page, which tells the outcomes of all training seeds."""
+    own = runs_of(_rows(study, run))
+    outcomes = [*own[["training_seed", "lifted", "placed", "episodes"]].itertuples(index=False, name=None)]
+    record = checkpoint / "encoder.json"
+    encoder = OBJECT.read(record) if record.is_file() else {}
+    train = {"seed": run.seed, "dataset": learned}
+    return render_card(repo_id, outcomes, run.arm.env["task"], train, OBJECT.read(checkpoint / "config.json"), encoder)
+
+
+def push(out: Path) -> None:
+    """Upload a release; what is on the Hub already in this version stays.
+
+    Raises:
+        MissingError: none was written.
+        InputError: a check found something wrong with a data set.
+        OSError: the Hub refused, or the connection broke.
+    """
+    if not (out / FILE).is_file():
+        raise MissingError(f"{out} holds no release: `make release HUB=NAME` writes one.")
+    release, api = RELEASE.read(out / FILE), HfApi()
+    for root in sorted(out.glob("datasets/*")):
+        try:
+            say(push_dataset(PushConfig(f"{release['user']}/{root.name}", root, tag=release["tag"])))
+        except TakenError as error:
+            say(str(error))
+    for kind, files, options in (("model", [*PUSHED, "README.md"], {}), ("space", None, {"space_sdk": "static"})):
+        for root in sorted(out.glob(f"{kind}s/*")):
+            repo = {"repo_id": f"{release['user']}/{root.name}", "repo_type": kind}
+            with hub_errors(repo["repo_id"]):
+                api.create_repo(**repo, exist_ok=True, **options)
+                api.upload_folder(**repo, folder_path=root, allow_patterns=files)
+                api.create_tag(**repo, tag=release["tag"], exist_ok=True)
+            say(f"Pushed: {repo['repo_id']}")
+
+
+RELEASE = Json("what says whose a release is", _Release)
 
 
 def main() -> None:
-    """Write the release, and upload it if the command line says so."""
+    """Write a release, or upload it, as the command line says."""
     parser = Parser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
-    parser.add_argument("--user", required=True, help="user or organisation on the Hub")
-    parser.add_argument("--push", action="store_true", help="upload it")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--user", help="write it for this user or organisation on the Hub")
+    what.add_argument("--push", action="store_true", help="upload it")
     parser.add_argument("--out", type=Path, default=ROOT / "outputs" / "hub", help="where it is written")
-    parser.add_argument("--store", type=Path, default=ROOT / "outputs" / "store", help="where runs were made")
+    parser.add_argument("--store", type=Path, default=ROOT / "outputs" / "store", help="where runs are made")
     parser.add_argument("--site", type=Path, default=ROOT / "outputs" / "site", help="where the site was built")
+    parser.add_argument("--workers", type=int, default=2, help="processes that generate demonstrations")
     asked = parser.parse_args()
-    load_plugins()
-    release = Release(asked.user, asked.out, Store(asked.store.absolute()), asked.site)
-    release.write()
     if asked.push:
-        release.push()
+        push(asked.out)
+        return
+    load_plugins()
+    write(asked.out, asked.user, Store(asked.store.absolute()), asked.site, Machine(asked.workers))
+    say(f"{asked.out} holds the release: look at it, then `python results/release.py --push`")
 
 
 if __name__ == "__main__":

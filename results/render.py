@@ -1,7 +1,7 @@
 """Writes the numbers of result tables in pages from the rows of studies: `python results/render.py`.
 
 A row of a table with a link to a report, whose title names an arm (setting/variant), has its numbers from there, each
-column by its head (`HEADS`). A link whose title begins with one of `WORDS`, or seed_N, has that number as its text:
+column by its head (`HEADS`). A link whose title begins with one of `WORDS` has that number as its text:
 
     | finer maps | 489/500 | 68 to 99 | [precise](results/precise/report.md "brick_to_bin_shifted/precise") |
     | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |
@@ -76,9 +76,6 @@ class Arm:
         often = Counter(sorted(self.runs["placed"]))
         return ", ".join(f"{placed}{OFTEN[min(times, 10)]}" for placed, times in often.items())
 
-    def of_seed(self, seed: int) -> str:
-        return str(self.runs.set_index("training_seed")["placed"][seed])
-
     def in_order(self) -> str:
         return ", ".join(map(str, self.runs["placed"]))
 
@@ -152,9 +149,7 @@ def _linked(link: re.Match[str], arms: Callable[[str, str], Arm]) -> str:
     """A link with its number as its text; one of a row of a table as it is."""
     if link["word"] is None:
         return link[0]
-    seed = link["word"].removeprefix("seed_")
-    word = (lambda arm: arm.of_seed(int(seed))) if seed.isdigit() else WORDS[link["word"]]
-    text = arms(link["file"], link["arm"]).tell(word)
+    text = arms(link["file"], link["arm"]).tell(WORDS[link["word"]])
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
 
 

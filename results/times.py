@@ -1,28 +1,19 @@
-"""How long the pieces that are left take, by those that were made: roughly, as machines differ."""
+"""How long the pieces that are left take, by what was made.
 
+It is rough: a variant that was not made in a setting is taken from another setting or study, whose demonstrations may
+be more or longer, and machines differ by a factor of three.
+"""
+
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from statistics import mean
+from statistics import median
 
 from lerobot_constructskill.artifacts.store import Node, Store
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.status import tell_seconds
 from lerobot_constructskill.study.timing import entries
-
-SET, SEED, EPISODES = ("demonstrations",), ("data", "training"), ("evaluation",)
-"""Stages, by what they take their time for."""
-
-
-@dataclass(frozen=True)
-class _Unit:
-    """Seconds that a stage took for one set of demonstrations, one seed or one episode."""
-
-    study: str
-    arm: str
-    stage: str
-    seconds: float
 
 
 class Times:
@@ -35,60 +26,54 @@ class Times:
     """
 
     def __init__(self, folders: Mapping[str, Path], episodes: Mapping[str, int], store: Store):
-        self._store = store
-        self._units = [unit for study, folder in folders.items() for unit in _units(study, folder, episodes[study])]
-        self._counted: set[tuple[Node, int | None]] = set()
-        self._seconds, self._unknown = 0.0, 0
+        self._store, self._counted = store, set()
+        self._took: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+        for study, folder in folders.items():
+            for entry in entries(folder):  # of a set and its features, of a seed, of an episode
+                number = {"training": entry["runs"], "evaluation": entry["runs"] * episodes[study]}
+                self._took[study, entry["arm"], entry["stage"]].append(
+                    entry["seconds"] / number.get(entry["stage"], 1)
+                )
+        self._known, self._unknown = 0.0, 0
 
     def tell(self, study: str, runs: Sequence[Run]) -> str:
         """How long a piece takes: those of its runs that are missing."""
-        try:
-            seconds = sum(self._of(study, run) for run in runs)
-        except LookupError:
-            self._unknown += 1
-            return "time unknown"
-        self._seconds += seconds
-        return tell_seconds(seconds)
+        parts = [seconds for run in runs for seconds in self._parts(study, run)]
+        known = sum(seconds for seconds in parts if seconds is not None)
+        self._known += known
+        if None not in parts:
+            return tell_seconds(known)
+        self._unknown += 1
+        return f"{tell_seconds(known)} and some of unknown time" if known else "time unknown"
 
     def total(self) -> str:
         """How long all of them take that were told so far."""
-        known = [tell_seconds(self._seconds)] if self._seconds else []
-        return ", and ".join(known + ([f"{plural(self._unknown, 'piece')} of unknown time"] if self._unknown else []))
+        known = [tell_seconds(self._known)] if self._known else []
+        return " and ".join(
+            [*known, *([f"what is unknown of {plural(self._unknown, 'piece')}"] * (self._unknown > 0))]
+        )
 
-    def _of(self, study: str, run: Run) -> float:
-        arm = run.arm
-        seconds = len(arm.starts) * self._each(study, run, EPISODES)
-        if arm.demonstrations and self._is_first(arm.demonstrations.node):
-            seconds += self._each(study, run, SET)
-        if arm.learner and self._is_first(run.checkpoints, run.seed):
-            seconds += self._each(study, run, SEED)
-        return seconds
+    def _parts(self, study: str, run: Run) -> Iterator[float | None]:
+        """The seconds of each stage that a run needs and nobody counted before; None where they are unknown."""
+        nodes: dict[str, Node] = {}
+        if run.arm.demonstrations:
+            nodes["demonstrations"] = run.arm.demonstrations.node
+        if run.checkpoints:
+            nodes |= {"data": run.checkpoints.inputs["data"], "training": run.checkpoints}
+        for stage, node in nodes.items():
+            once = (node, run.seed) if stage == "training" else node  # seeds that train together are one node
+            if not self._store.has(node) and once not in self._counted:
+                self._counted.add(once)
+                yield self._each(study, run, stage)
+        each = self._each(study, run, "evaluation")
+        yield None if each is None else len(run.arm.starts) * each
 
-    def _is_first(self, node: Node, seed: int | None = None) -> bool:
-        """Whether a node is not made, and counted only now."""
-        is_first = not self._store.has(node) and (node, seed) not in self._counted
-        self._counted.add((node, seed))
-        return is_first
+    def _each(self, study: str, run: Run, stage: str) -> float | None:
+        """By the same arm, else by the same variant of its study, else by that of any study.
 
-    def _each(self, study: str, run: Run, stages: Sequence[str]) -> float:
-        """Of stages: as the same arm took, else the same variant, and in the same study rather than in others.
-
-        Raises:
-            LookupError: there is none of that name.
+        It is the median: work of a killed process is not counted, so some are too short.
         """
-        same = [unit for unit in self._units if unit.arm.split("/")[-1] == run.arm.name and unit.stage in stages]
-        for fits in (lambda unit: (unit.study, unit.arm) == (study, run.arm.id), lambda unit: unit.study == study):
-            same = [unit for unit in same if fits(unit)] or same
-        each = {unit.stage: [] for unit in same}
-        for unit in same:
-            each[unit.stage].append(unit.seconds)
-        if not each:
-            raise LookupError(run.arm.id)
-        return sum(map(mean, each.values()))
-
-
-def _units(study: str, folder: Path, episodes: int) -> Iterator[_Unit]:
-    for entry in entries(folder):
-        for stages, number in ((SET, 1), (SEED, entry["runs"]), (EPISODES, entry["runs"] * episodes)):
-            if entry["stage"] in stages:
-                yield _Unit(study, entry["arm"], entry["stage"], entry["seconds"] / number)
+        same = [key for key in self._took if key[1].split("/")[-1] == run.arm.name and key[2] == stage]
+        own = [key for key in same if key[0] == study]
+        keys = [key for key in own if key[1] == run.arm.id] or own or same
+        return median(seconds for key in keys for seconds in self._took[key]) if keys else None

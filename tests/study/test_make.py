@@ -110,19 +110,23 @@ def recorded(length, seed):
 
 
 def test_what_pieces_share_is_counted_with_the_first(checkout, tmp_path, made):
-    """Two seeds of `a` learn from one set; `no_op` and `a` have two episodes each in both settings."""
-    seconds = {"demonstrations": 100, "data": 20, "training": 60}  # of the set; of two seeds
-    took = [{"arm": "one/a", "stage": stage, "runs": 2, "seconds": number} for stage, number in seconds.items()]
-    took += [{"arm": "one/a", "stage": "evaluation", "runs": 2, "seconds": 8}]
-    took += [{"arm": "one/no_op", "stage": "evaluation", "runs": 1, "seconds": 3}]
-    (checkout / "results/tiny" / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in took))
+    """Two seeds of `a` learn from one set, which both settings have; `no_op` and `a` have two episodes a run."""
+    took = {"demonstrations": 600, "data": 200, "training": 60, "evaluation": 8}  # of a set, of two seeds
+    lines = [{"arm": "one/a", "stage": stage, "runs": 2, "seconds": seconds} for stage, seconds in took.items()]
+    lines.append({"arm": "one/no_op", "stage": "evaluation", "runs": 1, "seconds": 240})
+    (checkout / "results/tiny" / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
     assert maker.status(maker.pieces()).splitlines() == [
-        "tiny/one: 3 runs, about 3 min",  # 191 s
+        "tiny/one: 3 runs, about 18 min",  # 600 + 200 + 60 + 8 + 240 s
         "tiny/one/act: 1 run, time unknown",
-        "tiny/two: 3 runs, about 11 s",
-        "0 of 3 pieces made; the others: about 3 min, and 1 piece of unknown time",
+        "tiny/two: 3 runs, about 4 min",  # 8 + 240 s
+        "0 of 3 pieces made; the others: about 23 min and what is unknown of 1 piece",
     ]
+    store = maker.store
+    node = next(run for run in maker.pieces("tiny/one")[0].runs if run.checkpoints).checkpoints.inputs["data"]
+    with store.claim([node]), store.writing(node) as folder:
+        folder.mkdir()
+    assert maker.status(maker.pieces("tiny/one")).startswith("tiny/one: 3 runs, about 15 min"), "without the features"
 
 
 def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkout, tmp_path, made):
@@ -136,7 +140,7 @@ def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkou
     assert maker.status(maker.pieces()).splitlines() == [
         "tiny/one: 3 runs, time unknown",
         "tiny/one/act: 1 run, time unknown",
-        "1 of 3 pieces made; the others: 2 pieces of unknown time",
+        "1 of 3 pieces made; the others: what is unknown of 2 pieces",
     ]
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(checkout), str(clone))

@@ -1,68 +1,101 @@
 """`make release`: what goes to the Hub is written, and uploaded to a Hub on loopback that speaks the protocol."""
 
+import json
 import os
-import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from hub_server import TOKENS, serve
 
-from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.lerobot_internals import load_plugins
-from lerobot_constructskill.parsing import parse
-from lerobot_constructskill.presets import find
-from lerobot_constructskill.scripts.study import StudyConfig
-from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.training.checkpoints import checkpoint_of
+import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.artifacts.store import Machine, Store
+from lerobot_constructskill.errors import InputError, MissingError, TakenError
+from lerobot_constructskill.study.rows import ROWS, read_rows
 
-pytestmark = pytest.mark.nightly  # what it calls, `push_dataset` above all, is tested by itself
+pytestmark = pytest.mark.nightly
 
 RESULTS = Path(__file__).parents[2] / "results"
 
-FEWER = """
-import sys
-sys.path.insert(0, sys.argv.pop(1))
-import release
-release.SETS = ("fast",)
-release.main()
-"""
-"""The script with one data set: to make the others takes half an hour."""
+TAG = f"v{version('lerobot_env_constructskill')}"
 
 
-def seventh(store):
-    """A folder for the checkpoint of training seed 7, as `make results` would leave it, but for its weights."""
-    load_plugins()
-    study = parse(StudyConfig, [], find("study", "precise")).study
-    run = next(run for run in list_runs(study) if run.id == "brick_to_bin_shifted/precise/seed_7")
-    with store.claim([run.checkpoints]), store.writing(run.checkpoints) as folder:
-        own = checkpoint_of(7, folder)
-        own.mkdir(parents=True)
-        (own / "config.json").write_text('{"type": "frozen_vit"}')
-        (own / "model.safetensors").write_bytes(b"weights")
+@pytest.fixture
+def release(monkeypatch):
+    """The script with one small study's worth of work: to train ten seeds takes half an hour."""
+    monkeypatch.syspath_prepend(str(RESULTS))
+    import release
+
+    monkeypatch.setattr(release, "SETS", ())
+    return release
 
 
-def test_a_release_is_written_and_pushed(demonstrations, tmp_path):
-    out, site = tmp_path / "hub", tmp_path / "site"
+@pytest.fixture
+def write(release, demonstrations, tmp_path, monkeypatch):
+    """Write a release; what the store has is made up, but for the data set."""
+    checkpoints, site = tmp_path / "checkpoints", tmp_path / "site"
     site.mkdir()
     (site / "index.html").write_text("the board")
-    shutil.copytree(demonstrations, out / "datasets" / "constructskill_fast")
-    seventh(Store(tmp_path / "store"))
+    for seed in range(10):
+        (checkpoints / f"seed_{seed}").mkdir(parents=True)
+        (checkpoints / f"seed_{seed}" / "config.json").write_text('{"type": "frozen_vit"}')
+        (checkpoints / f"seed_{seed}" / "model.safetensors").write_bytes(b"%d" % seed)
+        (checkpoints / f"seed_{seed}" / "log.txt").write_text("no part of it")
+    monkeypatch.setattr(
+        Store, "get", lambda store, node, machine: demonstrations if node.kind == "demonstrations" else checkpoints
+    )
+    return lambda out: release.write(out, "alice", Store(tmp_path / "store"), site, Machine())
+
+
+@pytest.fixture
+def as_published(release, monkeypatch):
+    """Weights have the hashes of the published rows."""
+    rows = read_rows(RESULTS / "precise" / ROWS)
+    own = rows[(rows["setting"] == "brick_to_bin_shifted") & (rows["variant"] == "precise")]
+    published = dict(zip(own["training_seed"], own["weights_sha256"], strict=True))
+    monkeypatch.setattr(release, "file_sha256", lambda path: published[int(path.read_text())])
+
+
+def test_weights_that_the_rows_are_not_of_are_refused_and_nothing_is_left(write, tmp_path):
+    with pytest.raises(
+        InputError, match="precise/brick_to_bin_shifted/precise/seed_0 here are not those of the publish"
+    ):
+        write(tmp_path / "hub")
+    assert not (tmp_path / "hub").exists()
+
+
+def test_what_is_no_release_stays(write, as_published, tmp_path, release):
+    (tmp_path / "hub").mkdir()
+    with pytest.raises(TakenError, match="exists already"):
+        write(tmp_path / "hub")
+    with pytest.raises(MissingError, match="holds no release"):
+        release.push(tmp_path / "hub")
+
+
+def test_a_release_is_written_and_pushed_and_a_second_push_changes_nothing(write, as_published, tmp_path):
+    out = tmp_path / "hub"
+    write(out)
+    (out / "models" / "of_yesterday").mkdir()
+    write(out)
     with serve() as hub:
         env = {**os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": next(iter(TOKENS))}
         env |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_OFFLINE": "0"}
-        where = [f"--out={out}", f"--site={site}", f"--store={tmp_path / 'store'}"]
-        command = [sys.executable, "-c", FEWER, str(RESULTS), "--user=alice", "--push", *where]
-        told = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-        assert not told.returncode, told.stderr
-    assert "9 of 10 checkpoints of precise/brick_to_bin_shifted/precise are not in" in told.stdout
-    policy = "models/alice/constructskill_precise_brick_to_bin_shifted_precise_seed_7"
-    assert {*hub.repos} == {"datasets/alice/constructskill_fast", "spaces/alice/constructskill", policy}
-    held = {name: repo.commits[repo.branches["main"]] for name, repo in hub.repos.items()}
+        for _ in range(2):
+            push = [sys.executable, str(RESULTS / "release.py"), "--push", f"--out={out}"]
+            told = subprocess.run(push, env=env, capture_output=True, text=True, check=False)
+            assert not told.returncode, told.stderr
+            held = {name: repo.commits[repo.branches["main"]] for name, repo in hub.repos.items()}
+    assert "constructskill_precise_brick_to_bin_shifted' holds a data set already" in told.stdout
+    policies = [f"models/alice/constructskill_precise_brick_to_bin_shifted_precise_seed_{seed}" for seed in range(10)]
+    data = "datasets/alice/constructskill_precise_brick_to_bin_shifted"
+    assert {*hub.repos} == {data, "spaces/alice/constructskill", *policies}
+    assert all(TAG in repo.tags for repo in hub.repos.values())
     assert hub.blobs[held["spaces/alice/constructskill"]["index.html"][0]] == b"the board"
     assert "sdk: static" in hub.blobs[held["spaces/alice/constructskill"]["README.md"][0]].decode()
-    card = hub.blobs[held[policy]["README.md"][0]].decode()
+    assert {*held[policies[7]]} == {"README.md", "config.json", "model.safetensors"}
+    card = hub.blobs[held[policies[7]]["README.md"][0]].decode()
     assert "| 7 (this one) | " in card and card.count("/50 |") == 20, "lifted and placed of all ten seeds"
-    assert "Trained on `alice/constructskill_precise_brick_to_bin_shifted`" in card
-    assert {"v3.0", "v0.1.0"} <= {*hub.repos["datasets/alice/constructskill_fast"].tags}
+    assert f"Trained on `alice/constructskill_precise_brick_to_bin_shifted`, revision `{TAG}`" in card
+    assert json.loads((out / "release.json").read_text()) == {"user": "alice", "tag": TAG}
