@@ -196,6 +196,19 @@ def test_training_seeds_may_begin_anywhere(tmp_path):
     assert numbers == {"2", "0", "3/3", "0/2"}, "every cell has its run"
 
 
+def test_a_setting_of_which_nothing_is_made_is_not_drawn_unless_all_are(tmp_path):
+    """Its table says so, and an empty panel says no more."""
+    study = SMALL | {"settings": SMALL["settings"] | {"later": next(iter(SMALL["settings"].values()))}}
+    rows = {run: episode_rows(study, run, 2, 2) for run in planned(study) if run[0] != "later"}
+    later = [missing_row(study, run) for run in planned(study) if run[0] == "later"]
+    titles = [
+        axis.get_title() for axis in seeds_figure(findings_of(study, [*sum(rows.values(), []), *later], tmp_path)).axes
+    ]
+    assert titles == ["fixed: lifted", "fixed: placed"]
+    nothing = findings_of(study, [missing_row(study, run) for run in planned(study)], tmp_path)
+    assert len(seeds_figure(nothing).axes) == 4
+
+
 def test_what_a_setting_is_read_with_comes_from_the_rows(findings):
     fixed, moved = findings.settings
     assert fixed.data_sets == ["fast", "fast_noise_free"]

@@ -63,8 +63,12 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def seeds_figure(findings: Findings) -> Figure:
-    """The paper's Figure 2a, for each setting: episodes of a run that met each criterion, one cell a training seed."""
-    sections = findings.sections
+    """The paper's Figure 2a: episodes of a run that met each criterion, one cell a training seed.
+
+    Settings of which nothing was made yet are left out, unless that is all of them.
+    """
+    made = [one for one in findings.sections if any(len(own.runs) for own in one.variants)]
+    sections = made or findings.sections
     stacked = {setting.name: len(_seeds_of(setting)) > MOST_BESIDE for setting in sections}
     heights = [(1 + stacked[one.name]) * (0.75 + 0.3 * len(one.variants)) + 0.2 for one in sections]
     figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
@@ -74,7 +78,7 @@ def seeds_figure(findings: Findings) -> Figure:
         axes = part.subplots(rows, columns, sharey=True)
         for axis, criterion in zip(axes, CRITERIA, strict=True):
             _draw_seeds(axis, setting, criterion, findings.episodes)
-            axis.set(title=f"{setting.label}: {criterion}" if len(sections) > 1 else criterion.capitalize())
+            axis.set(title=f"{setting.label}: {criterion}" if len(findings.sections) > 1 else criterion.capitalize())
         axes[0].set_yticks(np.arange(len(setting.variants)) + 0.5, [fill(one.label, 24) for one in setting.variants])
         axes[0].invert_yaxis()
     return figure
