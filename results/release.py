@@ -11,12 +11,11 @@ checkpoints.
 import json
 import shutil
 from argparse import RawDescriptionHelpFormatter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TypedDict
 
-import pandas as pd
 from huggingface_hub import HfApi
 
 from lerobot_constructskill.analysis.stats.outcomes import runs_of
@@ -33,7 +32,7 @@ from lerobot_constructskill.parsing import parse, parse_named
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.console import Parser, edge, say
 from lerobot_constructskill.scripts.dataset import CardConfig, PushConfig, push_dataset, write_card
-from lerobot_constructskill.scripts.push_policy import OBJECT, PUSHED, render_card
+from lerobot_constructskill.scripts.push_policy import PUSHED, card_of
 from lerobot_constructskill.scripts.study import StudyConfig
 from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import ROWS, read_rows
@@ -65,6 +64,9 @@ FILE = "release.json"
 class _Release(TypedDict):
     user: str
     tag: str
+
+
+RELEASE = Json("what says whose a release is", _Release)
 
 
 def called(name: str) -> str:
@@ -101,14 +103,9 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
             root = folder / "datasets" / called(name)
             shutil.copytree(store.get(node, machine), root)
             write_card(CardConfig(root, f"{user}/{root.name}"))
-        for data, own in runs.items():
-            for run, checkpoint in _checkpoints(POLICIES[data][0], own, store, machine):
-                root = folder / "models" / f"{called(POLICIES[data][0])}_{run.id.replace('/', '_')}"
-                shutil.copytree(checkpoint, root)
-                learned = {"repo_id": f"{user}/{called(data)}", "revision": release["tag"]}
-                write_text(
-                    root / "README.md", _card(f"{user}/{root.name}", POLICIES[data][0], run, checkpoint, learned)
-                )
+        for data, (study, _) in POLICIES.items():
+            learned = {"repo_id": f"{user}/{called(data)}", "revision": release["tag"]}
+            _write_policies(folder / "models", study, runs[data], learned, user, store, machine)
         shutil.copytree(site, folder / "spaces" / "constructskill")
         write_text(folder / "spaces" / "constructskill" / "README.md", SPACE)
         write_text(folder / FILE, json.dumps(release) + "\n")
@@ -118,33 +115,35 @@ def _runs(study: str, arm: str) -> list[Run]:
     return [run for run in list_runs(parse(StudyConfig, [], find("study", study)).study) if run.arm.id == arm]
 
 
-def _rows(study: str, run: Run) -> pd.DataFrame:
-    """The published rows of a run's arm."""
-    rows = read_rows(ROOT / "results" / study / ROWS)
-    return rows[(rows["setting"] == run.arm.setting) & (rows["variant"] == run.arm.name)]
+def _write_policies(
+    folder: Path,
+    study: str,
+    runs: Sequence[Run],
+    learned: dict[str, str],
+    user: str,
+    store: Store,
+    machine: Machine,
+) -> None:
+    """Copy the checkpoints of an arm's runs; the page of each tells the published outcomes of all of them.
 
-
-def _checkpoints(study: str, runs: Sequence[Run], store: Store, machine: Machine) -> Iterator[tuple[Run, Path]]:
-    """Each run's checkpoint. Raises InputError if one is not the one that the published rows are of."""
-    published = _rows(study, runs[0]).drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
+    Args:
+        learned: the data set that they learned from, `repo_id` and `revision`.
+    """
+    rows, arm = read_rows(ROOT / "results" / study / ROWS), runs[0].arm
+    rows = rows[(rows["setting"] == arm.setting) & (rows["variant"] == arm.name)]
+    weights = rows.drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
+    columns = ["training_seed", "lifted", "placed", "episodes"]
+    outcomes = [*runs_of(rows)[columns].itertuples(index=False, name=None)]
     for run in runs:
         checkpoint = checkpoint_of(run.seed, store.get(run.checkpoints, machine))
-        if file_sha256(checkpoint / "model.safetensors") != published[run.seed]:
+        if file_sha256(checkpoint / "model.safetensors") != weights[run.seed]:
             raise InputError(
                 f"The weights of {study}/{run.id} here are not those of the published rows: release on the kind of "
-                f"processor that made {study}/{run.arm.setting}, after `make results`."
+                f"processor that made {study}/{arm.setting}, after `make results`."
             )
-        yield run, checkpoint
-
-
-def _card(repo_id: str, study: str, run: Run, checkpoint: Path, learned: dict[str, str]) -> str:
-    """A checkpoint's page, which tells the outcomes of all training seeds."""
-    own = runs_of(_rows(study, run))
-    outcomes = [*own[["training_seed", "lifted", "placed", "episodes"]].itertuples(index=False, name=None)]
-    record = checkpoint / "encoder.json"
-    encoder = OBJECT.read(record) if record.is_file() else {}
-    train = {"seed": run.seed, "dataset": learned}
-    return render_card(repo_id, outcomes, run.arm.env["task"], train, OBJECT.read(checkpoint / "config.json"), encoder)
+        root, train = folder / f"{called(study)}_{run.id.replace('/', '_')}", {"seed": run.seed, "dataset": learned}
+        shutil.copytree(checkpoint, root)
+        write_text(root / "README.md", card_of(root, f"{user}/{root.name}", outcomes, arm.env["task"], train))
 
 
 def push(out: Path) -> None:
@@ -171,9 +170,6 @@ def push(out: Path) -> None:
                 api.upload_folder(**repo, folder_path=root, allow_patterns=files)
                 api.create_tag(**repo, tag=release["tag"], exist_ok=True)
             say(f"Pushed: {repo['repo_id']}")
-
-
-RELEASE = Json("what says whose a release is", _Release)
 
 
 def main() -> None:

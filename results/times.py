@@ -48,10 +48,10 @@ class Times:
 
     def total(self) -> str:
         """How long all of them take that were told so far."""
-        known = [tell_seconds(self._known)] if self._known else []
-        return " and ".join(
-            [*known, *([f"what is unknown of {plural(self._unknown, 'piece')}"] * (self._unknown > 0))]
-        )
+        unknown = f"what is unknown of {plural(self._unknown, 'piece')}"
+        if not self._unknown:
+            return tell_seconds(self._known)
+        return f"{tell_seconds(self._known)} and {unknown}" if self._known else unknown
 
     def _parts(self, study: str, run: Run) -> Iterator[float | None]:
         """The seconds of each stage that a run needs and nobody counted before; None where they are unknown."""

@@ -49,11 +49,9 @@ def push_policy(config: PushPolicyConfig) -> str:
     for name in (TRAIN_CONFIG, "config.json"):
         if not (config.policy_path / name).is_file():
             raise MissingError(f"{config.policy_path / name} is missing: name a checkpoint's pretrained_model folder.")
-    train, policy = TRAINED.read(config.policy_path / TRAIN_CONFIG), OBJECT.read(config.policy_path / "config.json")
-    record = config.policy_path / "encoder.json"
-    encoder = OBJECT.read(record) if record.is_file() else {}
+    train = TRAINED.read(config.policy_path / TRAIN_CONFIG)
     outcomes, task = seed_outcomes(config.evaluations), get_task(config.task).name
-    card, api = render_card(config.repo_id, outcomes, task, train, policy, encoder), HfApi()
+    card, api = card_of(config.policy_path, config.repo_id, outcomes, task, train), HfApi()
     with hub_errors(config.repo_id):
         api.create_repo(config.repo_id, private=config.private, exist_ok=True)
         if config.private:
@@ -79,6 +77,15 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     if not outcomes:
         raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
     return [(seed, *counts) for seed, counts in sorted(outcomes.items())]
+
+
+def card_of(
+    checkpoint: Path, repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any]
+) -> str:
+    """The card of a policy in a folder, as `render_card` makes it."""
+    record = checkpoint / "encoder.json"
+    encoder = OBJECT.read(record) if record.is_file() else {}
+    return render_card(repo_id, outcomes, task, train, OBJECT.read(checkpoint / "config.json"), encoder)
 
 
 def render_card(
