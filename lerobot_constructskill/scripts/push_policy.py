@@ -1,6 +1,7 @@
 """`constructskill-push-policy`: upload a checkpoint to the Hub, with its outcomes on its card."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,7 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
 
 
 def card_of(
-    checkpoint: Path, repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: dict[str, Any]
+    checkpoint: Path, repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: Mapping[str, Any]
 ) -> str:
     """The card of a policy in a folder, as `render_card` makes it."""
     record = checkpoint / "encoder.json"
@@ -92,7 +93,7 @@ def render_card(
     repo_id: str,
     outcomes: list[tuple[int, int, int, int]],
     task: str,
-    train: dict[str, Any],
+    train: Mapping[str, Any],
     policy: dict[str, Any],
     encoder: dict[str, Any],
 ) -> str:
