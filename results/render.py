@@ -19,7 +19,7 @@ import pandas as pd
 
 from lerobot_constructskill.analysis.report.formats import percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import by_draw, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import by_unit, count, runs_of
 from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_rows
 
 ROOT = Path(__file__).parents[1]
@@ -34,6 +34,7 @@ PAGES = [
 LINK = re.compile(r'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>\w+) )?(?P<arm>\w+/\w+)"\)')
 
 OFTEN = ["", "", " (two)", " (three)", " (four)", " (five)", " (six)", " (seven)", " (eight)", " (nine)", " (ten)"]
+"""How often a number stands in a list; above, in digits."""
 
 
 class Arm:
@@ -49,7 +50,7 @@ class Arm:
         if self.rows.empty:
             raise SystemExit(f"A page names {name}, which its study does not have.")
         self.runs = runs_of(self.rows)
-        self.draws = [draws.of(seed) for seed in self.runs["training_seed"]]
+        self.units = self.runs["training_seed"].map(draws.unit)
 
     def tell(self, number: Callable[["Arm"], str]) -> str:
         return "not run yet" if self.runs.empty else number(self)
@@ -62,19 +63,21 @@ class Arm:
         return f"{counts.met}/{counts.seeds}"
 
     def seeds_with_interval(self) -> str:
-        counts = count(self.runs["placed_rate"].to_numpy())
+        counts = count(by_unit(self.runs["placed_rate"], self.units))
         return f"{counts.met}/{counts.seeds} ({_range(clopper_pearson(counts))} %)"
 
     @property
     def mean(self) -> Estimate:
-        return mean_rate(by_draw(self.runs["placed_rate"], self.draws))
+        return mean_rate(by_unit(self.runs["placed_rate"], self.units))
 
     def episodes(self) -> str:
         return f"{self.met('placed')}: {percent(self.mean.value)} ({_range(self.mean)})"
 
     def each(self) -> str:
         often = Counter(sorted(self.runs["placed"]))
-        return ", ".join(f"{placed}{OFTEN[min(times, 10)]}" for placed, times in often.items())
+        return ", ".join(
+            f"{placed}{OFTEN[times] if times < len(OFTEN) else f' ({times})'}" for placed, times in often.items()
+        )
 
     def in_order(self) -> str:
         return ", ".join(map(str, self.runs["placed"]))

@@ -105,9 +105,15 @@ def with_draws(about: About, study: Path) -> About:
     """What is said of a policy, with what its study's folder says of its demonstrations.
 
     Raises:
-        InputError: the two contradict each other.
+        InputError: the two contradict each other, or some seeds share a draw and others do not.
     """
-    made = read_draws(study).demonstrations
+    draws = read_draws(study)
+    if draws.groups_seeds:
+        raise InputError(
+            f"Of the study, {draws.seeds_a_draw} training seeds share a draw of demonstrations; the seeds of an entry "
+            "learn from one draw, or each from its own."
+        )
+    made = draws.demonstrations
     if about.demonstrations not in (None, made):
         raise InputError(f"about.demonstrations is {about.demonstrations}, but those of the study are {made}.")
     return replace(about, demonstrations=made) if about.is_policy else about

@@ -78,7 +78,7 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
     if apart := _starts_apart(list(sides.values())):
         if asked.episodes:
             raise InputError("Draws of these sides have starts of their own: leave out --episodes.")
-        starts, episodes, either = sorted(set.union(*apart)), len(apart[0]), set.union(*apart)
+        starts, episodes, either = sorted(set.union(*apart)), max(map(len, apart)), set.union(*apart)
     else:
         starts = _common_starts(sides.values(), asked)
         for one in (a, b):
@@ -102,14 +102,19 @@ def _rate(placed: Sequence[bool]) -> float:
 def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:
     """Starts of each training seed, where both sides are known and their draws have the same starts of their own.
 
+    A seed that failed has those of the other side.
+
     Raises:
         InputError: of one side seeds have starts of their own, and the other side has not the same.
     """
     each = [side.starts_apart for side in known]
     if not any(each):
         return None
-    if len(known) == 2 and each[0] == each[1]:
-        return each[0]
+    apart = [starts for starts in each if starts]
+    if len(apart) == 2 and len(apart[0]) == len(apart[1]):
+        pairs = [*zip(*apart, strict=True)]
+        if all(a == b for a, b in pairs if a and b):
+            return [a or b for a, b in pairs]
     own = next(side for side, starts in zip(known, each, strict=True) if starts)
     raise InputError(
         f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose training "

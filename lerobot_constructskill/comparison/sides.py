@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.analysis.stats.outcomes import by_draw
+from lerobot_constructskill.analysis.stats.outcomes import by_unit
 from lerobot_constructskill.contract import OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import RECORDINGS, STARTING, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError, plural
@@ -67,20 +67,25 @@ class Side:
 
     @property
     def covered(self) -> str | None:
-        """What intervals over its seeds, or draws of several, cover; None if that is not known."""
+        """What intervals over its units cover; None if that is not known."""
         return self.draws.covered if self.draws else None
 
     def units(self, rates: Sequence[float]) -> np.ndarray:
-        """The rates that a comparison counts, of each training seed or, where these are known, of each draw."""
-        return by_draw(rates, [self.draws.of(number) for number in self.numbers]) if self.draws else np.array(rates)
+        """The rates that a comparison counts: of each training seed or, where draws have own data, of each draw."""
+        return by_unit(rates, [*map(self.draws.unit, self.numbers)]) if self.draws else np.array(rates)
+
+    @property
+    def unit(self) -> str:
+        """What a comparison counts, as a word."""
+        return "draw" if self.draws and self.draws.groups_seeds else "seed"
 
     @property
     def starts_apart(self) -> list[set[int]] | None:
-        """Starts of each seed, where no two draws share any; None where seeds have starts in common, or one failed."""
-        each = [set(placed) for placed in self.seeds if placed]
-        different = {frozenset(starts) for starts in each}
+        """Starts of each seed, empty if it failed, where no two draws share any; None where some are shared."""
+        each = [set(placed or ()) for placed in self.seeds]
+        different = {frozenset(starts) for starts in each if starts}
         apart = len(different) > 1 and sum(map(len, different)) == len(set.union(*each))
-        return each if apart and len(each) == len(self.seeds) and len({*map(len, each)}) == 1 else None
+        return each if apart and len({*map(len, different)}) == 1 else None
 
     @property
     def starts(self) -> set[int] | None:

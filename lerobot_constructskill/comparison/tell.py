@@ -26,10 +26,11 @@ def tell(matched: MatchedSides | OverTasks, alpha: float) -> str:
     if isinstance(matched, OverTasks):
         return _over_tasks(matched, alpha)
     judgement = matched.judgement
+    unit = _unit(matched)
     paragraphs = (
-        _sides(matched),
-        _conclusion(judgement, alpha),
-        _power(judgement, alpha),
+        _sides(matched, unit),
+        _conclusion(judgement, alpha, unit),
+        _power(judgement, alpha, unit),
         _covered(matched),
         _versions(matched),
     )
@@ -47,10 +48,17 @@ def _over_tasks(over: OverTasks, alpha: float) -> str:
     lines += [f"{'mean over tasks':<24}{shares[0]:<18}  {shares[1]}", ""]
     for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
         lines.append(f"{letter}, mean over tasks of each seed, %: {' '.join(f'{100 * rate:.0f}' for rate in rates)}")
-    paragraphs = ("\n".join(lines), _conclusion(over.judgement, alpha), _power(over.judgement, alpha), _covered(one))
+    unit = _unit(one)
+    told = _conclusion(over.judgement, alpha, unit), _power(over.judgement, alpha, unit)
+    paragraphs = ("\n".join(lines), *told, _covered(one))
     return "\n\n".join(
         [*filter(None, paragraphs), "Each seed counts once; episodes of different tasks are not pooled."]
     )
+
+
+def _unit(matched: MatchedSides) -> str:
+    """What is counted, as a word: a seed or a draw on both sides, or a unit, which is a seed here and a draw there."""
+    return matched.a.unit if matched.a.unit == matched.b.unit else "unit"
 
 
 def _every(side: Side) -> str:
@@ -66,7 +74,7 @@ def as_json(matched: MatchedSides | OverTasks) -> str:
     return json.dumps(values, indent=2) + "\n"
 
 
-def _sides(matched: MatchedSides) -> str:
+def _sides(matched: MatchedSides, unit: str) -> str:
     judgement, starts, where = matched.judgement, matched.starts, matched.conditions
     n = f"{len(starts)}"
     n += f", {matched.episodes} a draw" * (matched.episodes < len(starts))
@@ -84,7 +92,7 @@ def _sides(matched: MatchedSides) -> str:
     }
     lines += [
         "",
-        f"   {'seeds that placed':<19}{'episodes placed, mean of seeds':<32}each seed, of {matched.episodes}",
+        f"   {f'{unit}s that placed':<19}{f'episodes placed, mean of {unit}s':<32}each seed, of {matched.episodes}",
     ]
     for letter, (side, counts, mean, rates) in sides.items():
         each = [f"{rate * matched.episodes:.0f}" for rate in rates]
@@ -94,43 +102,44 @@ def _sides(matched: MatchedSides) -> str:
     return "\n".join(lines)
 
 
-def _conclusion(judgement: Judgement, alpha: float) -> str:
+def _conclusion(judgement: Judgement, alpha: float, unit: str) -> str:
     value, low, high = (100 * share for share in judgement.difference)
     spreads = f"A {100 * judgement.spread_a:.1f}, B {100 * judgement.spread_b:.1f} points"
     interval = f"{100 * (1 - alpha):g} % interval {low:+.0f} to {high:+.0f}"
     return (
-        f"{CONCLUSIONS[judgement.conclusion]}\n"
-        f"A - B: {value:+.1f} points ({interval}); p = {p_value(judgement.p_value)}, permutation of seeds.\n"
-        f"Seeds that placed at least once: p = {p_value(judgement.counts_p_value)}, Boschloo's exact test.\n"
-        f"Spread over seeds: standard deviation {spreads}; p = {p_value(judgement.spread_p_value)}.\n"
-        "The interval makes no assumption about how seeds vary, so it is wider than the tests suggest."
+        f"{CONCLUSIONS[judgement.conclusion].replace('seeds', f'{unit}s')}\n"
+        f"A - B: {value:+.1f} points ({interval}); p = {p_value(judgement.p_value)}, permutation of {unit}s.\n"
+        f"{unit.capitalize()}s that placed at least once: "
+        f"p = {p_value(judgement.counts_p_value)}, Boschloo's exact test.\n"
+        f"Spread over {unit}s: standard deviation {spreads}; p = {p_value(judgement.spread_p_value)}.\n"
+        f"The interval makes no assumption about how {unit}s vary, so it is wider than the tests suggest."
     )
 
 
-def _power(judgement: Judgement, alpha: float) -> str:
-    """What so many seeds can and cannot show."""
+def _power(judgement: Judgement, alpha: float, unit: str) -> str:
+    """What so many seeds or draws can and cannot show."""
     a, b = judgement.counts_a.seeds, judgement.counts_b.seeds
-    if max(a, b) == 1:
+    if max(a, b) == 1 and unit == "seed":
         return (
             "One training seed a side tells how these two checkpoints do, and nothing of their policies: another seed "
             "of either may do anything. Train more seeds of both."
         )
     if judgement.smallest_p_value >= alpha:
         return (
-            f"{plural(a, 'seed')} against {b} can show no difference, however large: their p-value is at least "
-            f"{judgement.smallest_p_value:.2g}. Train more seeds."
+            f"{plural(a, unit)} against {b} can show no difference, however large: their p-value is at least "
+            f"{judgement.smallest_p_value:.2g}. Train more {unit}s."
         )
     visible = judgement.visible
     if visible is None:
-        return "Seeds do not vary on either side, so how large a difference would be found cannot be told."
+        return f"{unit.capitalize()}s of neither side vary: how large a difference would be found cannot be told."
     found = "no difference, however large" if visible > 1 else f"a difference of {visible * 100:.0f} points"
-    told = f"With this many seeds, {TARGET:.0%} of comparisons would find {found}, if seeds vary as these do."
+    told = f"With this many {unit}s, {TARGET:.0%} of comparisons would find {found}, if {unit}s vary as these do."
     ratio = judgement.visible_spread
     told += f" Of spreads, they would find {'none' if ratio == inf else f'one that is {ratio:g} times the other'}."
     needed = judgement.seeds_needed
     if judgement.conclusion is Conclusion.INCONCLUSIVE and needed is not None:
         number = f"more than {MOST}" if needed == inf else f"about {needed}"
-        told += f" To find the difference that was seen, {number} seeds a side would be needed."
+        told += f" To find the difference that was seen, {number} {unit}s a side would be needed."
     return told
 
 

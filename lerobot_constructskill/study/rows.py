@@ -75,6 +75,15 @@ class Draws:
         """The draw that a training seed learns from; 0 where all share one."""
         return seed // self.seeds_a_draw if self.demonstrations == OWN else 0
 
+    def unit(self, seed: int) -> int:
+        """What of a training seed is independent of the others: the seed itself, or its draw where each is own."""
+        return self.of(seed) if self.demonstrations == OWN else seed
+
+    @property
+    def groups_seeds(self) -> bool:
+        """Whether there are several draws, each of several training seeds."""
+        return self.demonstrations == OWN and self.seeds_a_draw > 1
+
     @property
     def covered(self) -> str:
         """What intervals over the study's runs hold for."""

@@ -267,6 +267,8 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
     )
     assert "hold for other draws of demonstrations, other starts and other training seeds" in said[False]
     assert "What the spread between runs is made of" in said[False] and "figures/fixed_draws.png" in said[False]
+    assert "6/6 (54–100 %)" in said[True] and "3/3 (29–100 %)" in said[False]
+    assert "| draws that placed |" in said[False] and "a draw counts once" in said[False]
     mean = {shared: re.search(r"5\.8 \(([\d.]+)–([\d.]+)\)", text).groups() for shared, text in said.items()}
     assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])
 

@@ -212,6 +212,10 @@ def test_what_training_seeds_learnt_from_is_said_by_their_study(study):
     assert with_draws(replace(ABOUT, demonstrations="own"), study).draws == DRAWS["own"]
     with pytest.raises(InputError, match="demonstrations is shared, but those of the study are own"):
         with_draws(replace(ABOUT, demonstrations="shared"), study)
+    with pytest.raises(InputError, match="2 training seeds share a draw of demonstrations"):
+        (study / STUDY).write_text(yaml.safe_dump(said | {"seeds_a_draw": 2}))
+        with_draws(ABOUT, study)
+    (study / STUDY).write_text(yaml.safe_dump(said))
     expert = replace(ABOUT, observes="privileged")
     assert with_draws(expert, study) == expert and not expert.draws
 

@@ -114,10 +114,22 @@ def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, 
             compared(study(GOOD, f"own {len(other)}", draws=own), other)
 
 
+def test_a_failed_seed_whose_draw_has_starts_of_its_own_placed_nothing(study):
+    own = {"demonstrations": "own", "starts": "own"}
+    comparison = compared(study([9, None, 8, 7], draws=own), study([5, 5, 5, 5], "other", draws=own))
+    assert comparison.rates_a == [0.9, 0.0, 0.8, 0.7] and len(comparison.starts) == 40
+    assert "starts 1000 to 1039 (40, 10 a draw)" in tell(comparison, 0.05)
+
+
 def test_seeds_of_one_draw_count_as_one(study):
     draws = {"demonstrations": "own", "seeds_a_draw": 2}
     pairs, other = study([9, 7, 2, 2, 5, 5], draws=draws), study([5] * 6, "other", draws=draws)
     judgement = compared(pairs, other).judgement
+    told = tell(compared(pairs, other), 0.05)
+    assert "draws that placed" in told and "permutation of draws" in told
+    assert "units that placed" in tell(compared(pairs, study([5] * 6, "of one draw")), 0.05)
+    (unfinished,) = {compared(study([9, 7], "of one", draws=draws), other).judgement.counts_a.seeds}
+    assert unfinished == 1, "one draw is one draw, also where no other has been run yet"
     assert (judgement.counts_a.seeds, judgement.mean_a.value) == (3, pytest.approx(0.5))
     alone = compared(study([8, 2, 5], "alone"), study([5] * 3, "three")).judgement
     assert judgement.mean_a == pytest.approx(alone.mean_a) and judgement.p_value == alone.p_value

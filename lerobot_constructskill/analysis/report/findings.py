@@ -17,9 +17,9 @@ class Success(NamedTuple):
     """How often one variant met one criterion.
 
     Args:
-        counts: seeds that met it in at least one episode.
+        counts: seeds that met it in at least one episode; here and below draws, where each has its own demonstrations.
         exact: share of those seeds with Clopper-Pearson's interval.
-        mean: share of episodes, averaged over seeds, with Gaffke's interval over draws, or over seeds of one draw.
+        mean: share of episodes, averaged over seeds, with Gaffke's interval.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
     """
 
@@ -38,7 +38,7 @@ class VariantFindings:
         label: name in tables.
         demonstrations: name of the data set that it was trained on; None without one.
         training_seeds: planned seeds, in order.
-        runs: runs that were made, as rows of `runs_of`, with their `draw`.
+        runs: runs that were made, as rows of `runs_of`, with their `draw` and `unit`.
         success: criterion to success; empty if no run finished, so that missing runs never look like zeros.
         error: held-out error in m2, mean and range over seeds; None if it is unknown.
         errors_by_data: the same on each data set of the setting.

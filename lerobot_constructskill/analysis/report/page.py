@@ -83,6 +83,7 @@ def write_report(root: Path) -> Path:
         "study": read_text(root / STUDY),
         "findings": findings,
         "covered": draws.covered,
+        "groups_seeds": draws.groups_seeds,
         "films": partial(films, root, rows),
         "facts": provenance(root, rows),
         "stages": time_by_stage(root),

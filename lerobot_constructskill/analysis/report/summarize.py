@@ -19,7 +19,7 @@ from lerobot_constructskill.analysis.stats.comparisons import compare
 from lerobot_constructskill.analysis.stats.components import Components, split
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_draw, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_unit, count, runs_of
 from lerobot_constructskill.analysis.stats.walls import wall_of
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Draws
@@ -39,7 +39,9 @@ def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws) -> Findings:
     check_rows(rows)
     rows = rows.assign(draw=rows["training_seed"].map(draws.of))
     planned, runs = rows.drop_duplicates(RUN), runs_of(rows)
-    runs = runs.assign(draw=runs["training_seed"].map(draws.of))
+    runs = runs.assign(
+        **{name: runs["training_seed"].map(of) for name, of in (("draw", draws.of), ("unit", draws.unit))}
+    )
     of_variants = planned["role"] == VARIANT
     variants, references = (planned.loc[chosen, "variant"].unique() for chosen in (of_variants, ~of_variants))
     analysis.check(variants, planned["setting"].unique(), references)
@@ -177,12 +179,12 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
 def _success(runs: pd.DataFrame, criterion: str) -> Success:
     rates = _rates(runs, criterion)
     counts = count(rates)
-    mean = mean_rate(by_draw(rates, runs["draw"]))._replace(value=float(rates.mean()))
-    return Success(counts, clopper_pearson(counts), mean, float(rates.std()))
+    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
 
 
 def _rates(runs: pd.DataFrame, criterion: str) -> np.ndarray:
-    return runs[f"{criterion}_rate"].to_numpy()
+    """The share of each seed or, where each draw has demonstrations of its own, of each draw."""
+    return by_unit(runs[f"{criterion}_rate"], runs["unit"])
 
 
 def _data_sets(runs: pd.DataFrame) -> list[str]:
@@ -214,7 +216,8 @@ def _correlations(
 ) -> list[tuple[str, dict[str, Correlation | None]]]:
     def correlate(runs: pd.DataFrame) -> dict[str, Correlation | None]:
         error, variant = runs["heldout_mse_m2"].to_numpy(), runs["variant"].to_numpy()
-        return {name: kendall(error, runs[name].to_numpy(), variant, np.random.default_rng(0)) for name in CRITERIA}
+        rates = {name: runs[f"{name}_rate"].to_numpy() for name in CRITERIA}
+        return {name: kendall(error, of, variant, np.random.default_rng(0)) for name, of in rates.items()}
 
     # Two variants of the same checkpoints, evaluated differently, would count a seed's error twice.
     different = {

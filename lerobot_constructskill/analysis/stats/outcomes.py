@@ -53,15 +53,14 @@ def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
     return runs.reset_index()
 
 
-def by_draw(rates: Sequence[float] | np.ndarray, draws: Sequence[int]) -> np.ndarray:
-    """Mean of the rates of each draw of demonstrations, whose seeds are alike; where all share one draw, the rates.
+def by_unit(rates: Sequence[float] | np.ndarray, units: Sequence[int]) -> np.ndarray:
+    """Mean of the rates of each unit that is independent of the others: a training seed, or a draw with all its seeds.
 
     Args:
         rates: share in [0, 1] of the episodes of each seed, (seeds,).
-        draws: the draw that each seed learnt from.
+        units: the unit of each seed, `study.rows.Draws.unit`.
     """
-    found = pd.Series(rates, dtype=float).groupby(list(draws), sort=False).mean().to_numpy()
-    return found if len(found) > 1 else np.asarray(rates, dtype=float)
+    return pd.Series(rates, dtype=float).groupby(list(units), sort=False).mean().to_numpy()
 
 
 def count(rates: np.ndarray) -> Counts:
