@@ -13,13 +13,14 @@ from tempfile import TemporaryDirectory
 
 import pandas as pd
 
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.board import from_recordings
 from lerobot_constructskill.board.declaration import Declaration
 from lerobot_constructskill.board.protocol import LEVEL, PERTURBED_AXES
 from lerobot_constructskill.board.submission import read_submission
 from lerobot_constructskill.envs.recording import RECORDINGS
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.errors import UserError
 from lerobot_constructskill.scripts.console import say
 from lerobot_constructskill.scripts.verify import VerifyConfig, verify
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, read_rows
@@ -82,8 +83,8 @@ def keep(folder: Path, study: str, runs: Iterable[Run], store: Store) -> None:
     for run in runs:
         made, copy = store.folder(run) / RECORDINGS, kept(folder, run.digest)
         if made.is_file() and any(entry.holds(run) for entry in own.values()):
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(made, copy)
+            with replaced(copy) as partial:
+                shutil.copyfile(made, partial)
     _remove_others(folder, own.values())
 
 
@@ -115,10 +116,10 @@ def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]
             try:
                 _write(own[name], folder, read_submission(root).declaration, commit, made)
                 say(verify(VerifyConfig(made, record=board / "verified")))
-            except InputError as error:
+            except UserError as error:
                 say(f"No new entry {name}: {error}")
                 continue
-            shutil.rmtree(root)
+            root.rename(Path(scratch) / "before")
             made.rename(root)
         (board / "recovered" / f"{name}.parquet").unlink(missing_ok=True)
         written.append(name)

@@ -114,6 +114,7 @@ class Maker:
 
     def __init__(self, root: Path, store: Path, studies: Sequence[str] = STUDIES, **options):
         self.root, self.store, self.options = root, Store(store.absolute()), options
+        self._refused: set[str] = set()  # studies of which an entry was refused
         self.configs = {name: parse(StudyConfig, [], find("study", name)) for name in studies}
 
     def folder(self, study: str) -> Path:
@@ -140,11 +141,14 @@ class Maker:
         return chosen
 
     def due(self, pieces: Iterable[Piece]) -> Iterator[tuple[Piece, list[Run]]]:
-        """Each piece with its runs that are to be made, if any. A study's rows are read once for all that follow."""
+        """Each piece with the runs whose rows its study's folder lacks, if any.
+
+        What a killed process made is among them. A study's rows are read once for all its pieces that follow.
+        """
         for study, own in groupby(pieces, key=lambda piece: piece.study):
             together = list(own)
             runs = [run for piece in together for run in piece.runs]
-            absent = {run.id for run in Table(self.folder(study), runs, self.store, replaces=True).missing()}
+            absent = {run.id for run in Table(self.folder(study), runs, self.store).untold()}
             yield from ((piece, [run for run in piece.runs if run.id in absent]) for piece in together)
 
     def status(self, pieces: Sequence[Piece]) -> str:
@@ -163,7 +167,8 @@ class Maker:
     def is_committed(self, piece: Piece) -> bool:
         """Whether no rows and no entry of its study wait for a commit, as where a process was killed before that."""
         folder = self.folder(piece.study)
-        return not self._git("status", "--porcelain", "--", folder) and not whole(folder, piece.study)
+        waits = whole(folder, piece.study) and piece.study not in self._refused
+        return not waits and not self._git("status", "--porcelain", "--", folder)
 
     def make(self, piece: Piece) -> None:
         """Make what is missing of a piece, write its pages and commit them.
@@ -178,10 +183,11 @@ class Maker:
         run_study(config.study, text_of(config), folder, self.store, options)
         self.publish(piece)
 
-    def discard(self, piece: Piece) -> None:
-        """Remove the demonstrations and features of a piece that is made, unless another one will need them."""
+    def discard(self) -> None:
+        """Remove the demonstrations and features that no piece needs any more."""
         left = [run for _, runs in self.due(self.every) for run in runs]
-        for node in _bulky(piece.runs) - _bulky(left):
+        done = _bulky([run for piece in self.every for run in piece.runs]) - _bulky(left)
+        for node in filter(self.store.has, done):
             with self.store.claim([node]):
                 self.store.discard(node)
 
@@ -199,6 +205,8 @@ class Maker:
         self._commit(f"Results: {piece.name}", folder, *self._pages)
         if entries := write_whole(folder, piece.study, board, self._git("rev-parse", "--short", "HEAD").strip()):
             self._commit(f"Board: {', '.join(entries)}", folder, board)
+        if whole(folder, piece.study):
+            self._refused.add(piece.study)
 
     @property
     def _pages(self) -> list[Path]:
@@ -256,16 +264,15 @@ def main() -> None:
         say(maker.status(pieces))
         return
     for piece, runs in maker.due(pieces):
-        if runs:
-            if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
-                say(f"Stopped before {piece.name}; the same command continues there")
-                return
-            say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}")
-            maker.make(piece)
-            if asked.discard:
-                maker.discard(piece)
-        elif not maker.is_committed(piece):
-            maker.publish(piece)
+        if not runs and maker.is_committed(piece):
+            continue
+        if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
+            say(f"Stopped before {piece.name}; the same command continues there")
+            return
+        say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}")
+        maker.make(piece)
+        if asked.discard:
+            maker.discard()
     say("All is made")
 
 

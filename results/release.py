@@ -90,22 +90,23 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
     """
     if not (site / "index.html").is_file():
         raise MissingError(f"{site} has no index.html: `make docs` builds the site.")
-    if (out / FILE).is_file():
-        shutil.rmtree(out)
     release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}")
     sets = {
         name: Demonstrations(parse_named(GenerateConfig, "generate", name, ["--repo_id=local/set"])) for name in SETS
     }
     runs = {data: _runs(study, arm) for data, (study, arm) in POLICIES.items()}
     sets |= {data: own[0].arm.demonstrations.node for data, own in runs.items()}
+    made = {name: store.get(node, machine) for name, node in sets.items()}
+    policies = {data: _Policies(study, runs[data], store, machine) for data, (study, _) in POLICIES.items()}
+    if (out / FILE).is_file():  # an earlier one
+        shutil.rmtree(out)
     with staged(out) as folder:
-        for name, node in sets.items():
+        for name, data in made.items():
             root = folder / "datasets" / called(name)
-            shutil.copytree(store.get(node, machine), root)
+            shutil.copytree(data, root)
             write_card(CardConfig(root, f"{user}/{root.name}"))
-        for data, (study, _) in POLICIES.items():
-            learned = {"repo_id": f"{user}/{called(data)}", "revision": release["tag"]}
-            _write_policies(folder / "models", study, runs[data], learned, user, store, machine)
+        for name, learned in policies.items():
+            learned.write(folder / "models", user, {"repo_id": f"{user}/{called(name)}", "revision": release["tag"]})
         shutil.copytree(site, folder / "spaces" / "constructskill")
         write_text(folder / "spaces" / "constructskill" / "README.md", SPACE)
         write_text(folder / FILE, json.dumps(release) + "\n")
@@ -115,35 +116,39 @@ def _runs(study: str, arm: str) -> list[Run]:
     return [run for run in list_runs(parse(StudyConfig, [], find("study", study)).study) if run.arm.id == arm]
 
 
-def _write_policies(
-    folder: Path,
-    study: str,
-    runs: Sequence[Run],
-    learned: dict[str, str],
-    user: str,
-    store: Store,
-    machine: Machine,
-) -> None:
-    """Copy the checkpoints of an arm's runs; the page of each tells the published outcomes of all of them.
+class _Policies:
+    """The checkpoints of an arm's runs.
 
-    Args:
-        learned: the data set that they learned from, `repo_id` and `revision`.
+    Raises:
+        InputError: one is not that of the published rows.
     """
-    rows, arm = read_rows(ROOT / "results" / study / ROWS), runs[0].arm
-    rows = rows[(rows["setting"] == arm.setting) & (rows["variant"] == arm.name)]
-    weights = rows.drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
-    columns = ["training_seed", "lifted", "placed", "episodes"]
-    outcomes = [*runs_of(rows)[columns].itertuples(index=False, name=None)]
-    for run in runs:
-        checkpoint = checkpoint_of(run.seed, store.get(run.checkpoints, machine))
-        if file_sha256(checkpoint / "model.safetensors") != weights[run.seed]:
-            raise InputError(
-                f"The weights of {study}/{run.id} here are not those of the published rows: release on the kind of "
-                f"processor that made {study}/{arm.setting}, after `make results`."
-            )
-        root, train = folder / f"{called(study)}_{run.id.replace('/', '_')}", {"seed": run.seed, "dataset": learned}
-        shutil.copytree(checkpoint, root)
-        write_text(root / "README.md", card_of(root, f"{user}/{root.name}", outcomes, arm.env["task"], train))
+
+    def __init__(self, study: str, runs: Sequence[Run], store: Store, machine: Machine):
+        self._study, self._arm = study, runs[0].arm
+        rows = read_rows(ROOT / "results" / study / ROWS)
+        self._rows = rows[(rows["setting"] == self._arm.setting) & (rows["variant"] == self._arm.name)]
+        weights = self._rows.drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
+        self._checkpoints = {run: checkpoint_of(run.seed, store.get(run.checkpoints, machine)) for run in runs}
+        for run, checkpoint in self._checkpoints.items():
+            if file_sha256(checkpoint / "model.safetensors") != weights[run.seed]:
+                raise InputError(
+                    f"The weights of {study}/{run.id} here are not those of the published rows: release on the kind "
+                    f"of processor that made {study}/{self._arm.setting}, after `make results`."
+                )
+
+    def write(self, folder: Path, user: str, learned: dict[str, str]) -> None:
+        """Copy them; the page of each tells the published outcomes of all of them.
+
+        Args:
+            learned: the data set that they learned from, `repo_id` and `revision`.
+        """
+        columns = ["training_seed", "lifted", "placed", "episodes"]
+        outcomes = [*runs_of(self._rows)[columns].itertuples(index=False, name=None)]
+        for run, checkpoint in self._checkpoints.items():
+            root = folder / f"{called(self._study)}_{run.id.replace('/', '_')}"
+            shutil.copytree(checkpoint, root)
+            task, train = self._arm.env["task"], {"seed": run.seed, "dataset": learned}
+            write_text(root / "README.md", card_of(root, f"{user}/{root.name}", outcomes, task, train))
 
 
 def push(out: Path) -> None:
@@ -167,8 +172,11 @@ def push(out: Path) -> None:
             repo = {"repo_id": f"{release['user']}/{root.name}", "repo_type": kind}
             with hub_errors(repo["repo_id"]):
                 api.create_repo(**repo, exist_ok=True, **options)
-                api.upload_folder(**repo, folder_path=root, allow_patterns=files)
-                api.create_tag(**repo, tag=release["tag"], exist_ok=True)
+                if release["tag"] in {tag.name for tag in api.list_repo_refs(**repo).tags}:
+                    say(f"'{repo['repo_id']}' holds {release['tag']} already")
+                    continue
+                api.upload_folder(**repo, folder_path=root, allow_patterns=files, delete_patterns="*")
+                api.create_tag(**repo, tag=release["tag"])
             say(f"Pushed: {repo['repo_id']}")
 
 

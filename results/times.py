@@ -26,7 +26,8 @@ class Times:
     """
 
     def __init__(self, folders: Mapping[str, Path], episodes: Mapping[str, int], store: Store):
-        self._store, self._counted = store, set()
+        self._store = store
+        self._counted: set[Node | tuple[Node, int]] = set()
         self._took: dict[tuple[str, str, str], list[float]] = defaultdict(list)
         for study, folder in folders.items():
             for entry in entries(folder):  # of a set and its features, of a seed, of an episode

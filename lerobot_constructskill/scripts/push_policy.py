@@ -43,7 +43,7 @@ def push_policy(config: PushPolicyConfig) -> str:
         ValueError: there is no such task.
         OSError: the Hub refused, or the connection broke.
     """
-    from huggingface_hub import HfApi
+    from huggingface_hub import CommitOperationAdd, HfApi
 
     from lerobot_constructskill.dataset.hub import check_private, hub_errors
 
@@ -57,8 +57,10 @@ def push_policy(config: PushPolicyConfig) -> str:
         api.create_repo(config.repo_id, private=config.private, exist_ok=True)
         if config.private:
             check_private(config.repo_id)
-        api.upload_folder(repo_id=config.repo_id, folder_path=config.policy_path, allow_patterns=PUSHED)
-        api.upload_file(repo_id=config.repo_id, path_or_fileobj=card.encode(), path_in_repo="README.md")
+        files = [path for pattern in PUSHED for path in config.policy_path.glob(pattern)]
+        added = [CommitOperationAdd(path.name, path) for path in files]
+        added.append(CommitOperationAdd("README.md", card.encode()))
+        api.create_commit(config.repo_id, added, commit_message="Weights, configuration and card")
     return f"Pushed: {config.repo_id}"
 
 

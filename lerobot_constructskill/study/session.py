@@ -4,7 +4,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from itertools import batched, groupby
@@ -68,6 +68,8 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
         asked_for = {run.id for run in chosen}
         others = [run for run in runs if run.id not in asked_for]
         validate(chosen, others, store, Machine(options.workers), root)
+        if missing:
+            _write_provenance(root, earlier, time.monotonic() - start)
         table.read_again()
         table.write()
         return table
@@ -149,7 +151,7 @@ def _make_all(job: Job) -> tuple[list[Run], list[Exception]]:
     return made, stopped
 
 
-def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> None:
+def _write_provenance(root: Path, earlier: Mapping[str, Any], seconds: float) -> None:
     """Say where the study ran, on every machine, and for how long in all; what else it says stays.
 
     Args:
@@ -157,7 +159,8 @@ def _write_provenance(root: Path, earlier: dict[str, Any], seconds: float) -> No
         seconds: how long this session has taken.
     """
     machines = [*earlier.get("machine", "").split("; "), f"{os.cpu_count()} cores, {processor()}"]
-    facts = earlier | {
+    facts = {
+        **earlier,
         WALL_TIME: round(earlier.get(WALL_TIME, 0) + seconds),
         "machine": "; ".join(dict.fromkeys(one for one in machines if one)),
     }

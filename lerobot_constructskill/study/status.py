@@ -29,7 +29,7 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
     for name, alike in groupby(chosen, key=lambda run: run.arm.id):
         runs = list(alike)
         lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
-        if own := [run for run in due if run in runs]:
+        if own := [run for run in due if run.arm.id == name]:
             lines.append(f"    to make: {_seeds(own)}, {tell_time(own, took)}")
     return "\n".join([*lines, _total(table, due, took)])
 

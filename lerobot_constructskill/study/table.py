@@ -45,6 +45,10 @@ class Table:
         """The runs that have not been made."""
         return [run for run in self.runs if self.made(run) is None]
 
+    def untold(self) -> list[Run]:
+        """The runs of which the table in the folder had no rows, whatever the store has."""
+        return [run for run in self.runs if not any(self._rows_before(run, failed) for failed in (False, True))]
+
     def failed(self) -> list[Run]:
         """The runs that were made and failed."""
         return [run for run in self.runs if (rows := self.made(run)) and rows[0].error_kind]

@@ -47,6 +47,7 @@ def test_a_data_set_and_a_policy_go_to_the_hub_and_come_back(tmp_path, monkeypat
         (checkpoint / "config.json").write_text(json.dumps(saved | {"device": "cuda"}))  # trained on another machine
         run("constructskill-push-policy", *flags)
         run("lerobot-eval", "--policy.path=alice/act", *EVAL, f"--output_dir={tmp_path / 'again'}")
+        assert len(hub.repos["models/alice/act"].commits) == 2, "the empty one, and that of weights and card"
         files = hub.repos["models/alice/act"].commits[hub.repos["models/alice/act"].branches["main"]]
         card = hub.blobs[files["README.md"][0]].decode()
         assert json.loads(hub.blobs[files["config.json"][0]])["device"] == "cuda", "and pushed from here"

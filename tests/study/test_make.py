@@ -176,19 +176,37 @@ def test_the_numbers_of_a_page_are_committed_with_their_rows(checkout, tmp_path,
     )
 
 
-def test_a_process_that_was_killed_before_its_commit_makes_it_up(checkout, tmp_path, made, monkeypatch):
+@pytest.mark.parametrize("during", ["publish", "validate"])
+def test_a_process_that_was_killed_before_its_commit_makes_it_up(during, checkout, tmp_path, made, monkeypatch):
     maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
     monkeypatch.setattr(made, "ROOT", checkout)
     monkeypatch.setattr(made, "PAGES", [checkout / "README.md"])
     monkeypatch.setattr(made, "Maker", lambda *_, **options: maker)
     monkeypatch.setattr(sys, "argv", ["make.py", "--only=tiny/two"])
     with monkeypatch.context() as killed:
-        killed.setattr(maker, "publish", lambda piece: sys.exit("killed"))
+        killed.setattr(maker if during == "publish" else session, during, lambda *_: sys.exit("killed"))
         with pytest.raises(SystemExit, match="killed"):
             made.main()
     assert not maker.is_committed(maker.pieces()[0])
+    validated = []
+    monkeypatch.setattr(session, "validate", lambda *asked: validated.append(asked))
     made.main()
+    assert validated, "held-out errors that are missing are measured"
     assert git(checkout, "log", "-1", "--format=%s") == "Results: tiny/two\n" and maker.is_committed(maker.pieces()[0])
+
+
+def test_rows_that_the_store_alone_has_are_due(checkout, tmp_path, made):
+    """As where a process was killed between a run and its rows."""
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
+    maker, elsewhere = (made.Maker(root, tmp_path / "store", ["tiny"]) for root in (checkout, clone))
+    (piece,) = maker.pieces("tiny/two")
+    maker.make(piece)
+    ((same, runs),) = elsewhere.due(elsewhere.pieces("tiny/two"))
+    assert [run.id for run in runs] == [run.id for run in piece.runs]
+    elsewhere.make(same)
+    assert load_rows(clone / "results/tiny" / ROWS) == load_rows(checkout / "results/tiny" / ROWS)
+    assert not next(elsewhere.due([same]))[1] and elsewhere.is_committed(same)
 
 
 def test_nothing_is_made_of_sources_that_are_in_no_commit(checkout, tmp_path, made):
@@ -211,7 +229,7 @@ def test_what_no_piece_needs_any_more_can_be_removed(checkout, tmp_path, made):
             folder.mkdir()
     for piece, left in ((one, nodes), (act, nodes), (two, set())):
         maker.make(piece)
-        maker.discard(piece)
+        maker.discard()
         assert {node for node in nodes if maker.store.has(node)} == left, piece.name
 
 
@@ -260,8 +278,11 @@ def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_t
         elsewhere.make(last)
     assert "No new entry mine: seed 3 ends otherwise" in capsys.readouterr().out
     assert git(clone, "log", "-1", "--format=%s") == "Results: tiny/one\n" and not git(clone, "status", "--porcelain")
-    assert len(git(clone, "ls-files", "results/tiny/recordings").split()) == 4 and not elsewhere.is_committed(last)
-    elsewhere.publish(last)  # as the next command does
+    assert len(git(clone, "ls-files", "results/tiny/recordings").split()) == 4
+    assert elsewhere.is_committed(last), "a command tries a refused entry once"
+    elsewhere = made.Maker(clone, tmp_path / "another_store", ["tiny"])
+    assert not elsewhere.is_committed(last)
+    elsewhere.make(last)  # as the next command does
     assert elsewhere.is_committed(last)
     entry = read_submission(clone / "board/entries/mine")
     assert [root.name for root in replayed] == ["mine"] and git(clone, "log", "-1", "--format=%s") == "Board: mine\n"

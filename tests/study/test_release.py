@@ -88,6 +88,7 @@ def test_a_release_is_written_and_pushed_and_a_second_push_changes_nothing(write
             assert not told.returncode, told.stderr
             held = {name: repo.commits[repo.branches["main"]] for name, repo in hub.repos.items()}
     assert "constructskill_precise_brick_to_bin_shifted' holds a data set already" in told.stdout
+    assert told.stdout.count(f"holds {TAG} already") == 11 and "Pushed" not in told.stdout
     policies = [f"models/alice/constructskill_precise_brick_to_bin_shifted_precise_seed_{seed}" for seed in range(10)]
     data = "datasets/alice/constructskill_precise_brick_to_bin_shifted"
     assert {*hub.repos} == {data, "spaces/alice/constructskill", *policies}
