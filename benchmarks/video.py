@@ -30,7 +30,7 @@ def main(name: str = "brick_on_brick", backbone: str = "efficientnet_lite0_fine"
     env = ConstructSkillEnv(name, OBS_TYPE, task.horizon)
     frames, _ = demonstrate(env, make_expert(task, ExpertConfig()), NoiseConfig(), DEMO_SEED_START)
     env.close()
-    rows, features = range(0, len(frames), EVERY), demonstration_features(task, OBS_TYPE)
+    rows, features = range(0, len(frames), EVERY), demonstration_features(task, OBS_TYPES[OBS_TYPE])
     for camera in OBS_TYPES[OBS_TYPE]:
         key = CAMERAS[camera].key
         rendered = torch.stack([torch.from_numpy(frames[row][key]).permute(2, 0, 1) / 255 for row in rows])

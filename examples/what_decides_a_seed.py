@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
+from films import side_by_side
 
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill.contract import FPS
@@ -70,7 +71,11 @@ def main(results: str, store: str, variant: str, out: str, seeds: str = "10") ->
     (Path(out) / "table.md").write_text("\n".join(table) + "\n")
     print("\n".join(table))
     if placed and failed:
-        write_video(Path(out) / "failing_and_succeeding.mp4", beside(plain[failed[0]], plain[placed[0]]), FPS)
+        write_video(
+            Path(out) / "failing_and_succeeding.mp4",
+            side_by_side([plain[failed[0]].frames, plain[placed[0]].frames]),
+            FPS,
+        )
 
 
 def play(agents: Mapping[Any, PolicyAgent], env: dict[str, Any]) -> dict[Any, Watched]:
@@ -81,7 +86,9 @@ def play(agents: Mapping[Any, PolicyAgent], env: dict[str, Any]) -> dict[Any, Wa
         watched[number].hand = step.sim["tcp_pose"][:3]
         watched[number].frames.append(step.seen["pixels"]["base"])
 
-    for number, rollout in roll_out(list(agents.values()), env, [1000], on_step=watch, filmed=range(len(names))):
+    for number, rollout in roll_out(
+        list(agents.values()), env, [[1000]] * len(names), on_step=watch, filmed=range(len(names))
+    ):
         if rollout.error:
             raise rollout.error
         watched[number].stage = rollout.episodes[0].stage
@@ -118,12 +125,6 @@ def disagreement(policies: list[FrozenViTChunkPolicy], frames: list[np.ndarray])
     pooled = policies[0].pool(images)
     moves = torch.stack([policy.heads(pooled)[0][:, 0, :3] for policy in policies])
     return (moves - moves.mean(dim=0)).pow(2).mean().sqrt().item()
-
-
-def beside(left: Watched, right: Watched) -> list[np.ndarray]:
-    """Two episodes in one film; the shorter one waits at its end."""
-    length = max(len(left.frames), len(right.frames))
-    return [np.hstack([film.frames[min(i, len(film.frames) - 1)] for film in (left, right)]) for i in range(length)]
 
 
 if __name__ == "__main__":

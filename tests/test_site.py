@@ -6,10 +6,8 @@ import re
 import subprocess
 import sys
 import threading
-import tomllib
 from html.parser import HTMLParser
 from pathlib import Path
-from runpy import run_path
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -26,7 +24,6 @@ LARGEST = 16e6
 LOADING = {"link", "script", "img", "video", "source", "iframe"}
 """Elements that a browser fetches without being asked."""
 
-SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
@@ -57,13 +54,6 @@ def site(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def read(site) -> dict[Path, Reader]:
     return {page: Reader(page) for page in site.rglob("*.html")}
-
-
-@pytest.mark.parametrize(("name", "target"), [script for script in SCRIPTS.items() if "-" in script[0]])
-def test_every_field_of_every_command_is_explained(name, target):
-    text = run_path(str(ROOT / "website/generated.py"))["help_of"](name, target)
-    bare = re.findall(r"^  --(?:\w+\.)*(\w+) \S+ *\n(?! {10})", text, re.MULTILINE)
-    assert not [field for field in bare if not re.search(rf"^ +(\w+, )*{field}(, \w+)*: ", text, re.MULTILINE)]
 
 
 def test_every_link_leads_somewhere(site, read):

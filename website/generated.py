@@ -98,7 +98,8 @@ def policies(root: Path) -> dict[str, list[str]]:
         envs, runs = read_environments(folder), runs_of(rows[rows["error_kind"].isna()])
         for (setting, variant), own in runs.groupby(["setting", "variant"]):
             lifted, placed = ("{}/{}".format(*count(own[f"{criterion}_rate"])) for criterion in ("lifted", "placed"))
-            cells = (analysis.label(variant), lifted, placed, f"{own['placed'].sum()}/{own['episodes'].sum()}")
+            policy = analysis.label(variant) + (f", {analysis.label(setting)}" if envs[setting].get("perturb") else "")
+            cells = (policy, lifted, placed, f"{own['placed'].sum()}/{own['episodes'].sum()}")
             link = f"[{name}](../../results/{folder.name}/report.md)"
             outcomes[envs[setting]["task"]].append(f"| {' | '.join(cells)} | {link} |")
     return outcomes

@@ -1,6 +1,7 @@
 """Finds what has changed since a node was made: names of packages and rooms, places of settings."""
 
 from collections.abc import Iterator, Mapping
+from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
@@ -68,4 +69,7 @@ def _code_now(name: str, before: str) -> str | None:
     if name.startswith(PREFIX):
         room = read_table().get(name.removeprefix(PREFIX))
         return room and revision(room)
-    return code_of(name).get(name) if "source " in before else installed(name)
+    if "source " not in before:
+        return installed(name)
+    modules = [module for module, owners in packages_distributions().items() if name in owners]
+    return code_of(*modules).get(name)

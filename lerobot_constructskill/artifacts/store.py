@@ -302,7 +302,7 @@ class Store:
         """Add a failure's traceback to the log."""
         log = self.log(node)
         log.parent.mkdir(parents=True, exist_ok=True)
-        with log.open("a", encoding="utf-8") as file:
+        with log.open("a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(f"{datetime.now():%Y-%m-%d %H:%M:%S}\n{failure.traceback}\n")
 
     def discard(self, node: Node) -> None:

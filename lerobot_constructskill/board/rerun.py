@@ -8,6 +8,7 @@ import numpy as np
 import yaml
 
 from lerobot_constructskill.analysis.stats.comparisons import holm, mean_p_value
+from lerobot_constructskill.analysis.stats.judgement import smallest_p_value
 from lerobot_constructskill.board.protocol import RERUN_ALPHA, BoardSetting, PublicValue, fresh_settings, fresh_start
 from lerobot_constructskill.board.submission import Submission
 from lerobot_constructskill.contract import ANY_ACTION, OBS_TYPES
@@ -104,7 +105,7 @@ def confirm(pairs: Pairs, units: str, how: str) -> dict[str, tuple[float, float]
     Raises:
         InputError: it went worse, or the units are too few to show that.
     """
-    could_be = holm([mean_p_value(np.ones_like(own), np.zeros_like(fresh)) for own, fresh in pairs.values()])
+    could_be = holm([smallest_p_value(len(own), len(fresh)) for own, fresh in pairs.values()])
     if min(could_be) >= RERUN_ALPHA:
         raise InputError(
             f"Too few {units} to confirm anything: if all placed as submitted and none {how}, p would be "

@@ -8,6 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.dataset.dataset import DataSet
 from lerobot_constructskill.dataset.frames import pictures
 from lerobot_constructskill.demos.expert import Phase
@@ -73,5 +74,5 @@ def _firsts(data: DataSet, most: int) -> list[int]:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, pil_kwargs={"quality": 90})
+    with replaced(path) as partial:
+        figure.savefig(partial, dpi=110, pil_kwargs={"quality": 90})

@@ -1,6 +1,7 @@
 """Makes a plan of an IFC file: every building element whose box is one of `KINDS` is laid where the model has it."""
 
 from collections.abc import Iterator
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,7 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
     except (RuntimeError, OSError, AttributeError, ifcopenshell.Error) as error:
         raise InputError(f"'{path}' is not an IFC file ({' '.join(str(error).split())[:100]}).") from None
     settings = ifcopenshell.geom.settings()
-    taken: dict[str, int] = {}
+    taken: set[str] = set()
     for part in parts:
         if part.Representation is None:
             continue
@@ -97,8 +98,9 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         kind = next((name for name, one in KINDS.items() if (abs(size - one.size) < SAME).all()), None)
         if kind is not None:
             name = "".join(letter if letter.isalnum() else "_" for letter in (part.Name or kind)).strip("_") or kind
-            taken[name] = taken.get(name, 0) + 1
-            yield (name if taken[name] == 1 else f"{name}_{taken[name]}"), kind, middle, size
+            free = next(one for one in chain([name], (f"{name}_{n}" for n in count(2))) if one not in taken)
+            taken.add(free)
+            yield free, kind, middle, size
 
 
 def _millimetres(size: tuple[float, ...]) -> str:

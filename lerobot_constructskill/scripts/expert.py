@@ -1,5 +1,6 @@
 """Commands about the scripted expert of a task: `constructskill-film` and `constructskill-check-task`."""
 
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -63,16 +64,18 @@ def film(config: FilmConfig) -> str:
 
     out = config.out or Path("outputs") / f"{label_of(config.task)}.mp4"
     expert = make_expert(get_task(config.task), ExpertConfig())
-    env = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed, film=True)
     frames = []
 
     def watch(phase, obs):
         frames.append(env.render() if config.view == "close" else obs["pixels"]["base"])
         bar.update()
 
-    with Progress(desc=f"filming {config.task}", unit="step") as bar:
+    made = ConstructSkillEnv(config.task, perturb=config.perturb, perturb_seed=config.perturb_seed, film=True)
+    with (
+        closing(made) as env,
+        Progress(desc=f"filming {config.task}", unit="step") as bar,
+    ):
         _, success = demonstrate(env, expert, config.noise, config.seed, watch=watch)
-    env.close()
     with replaced(out) as partial, quiet():
         write_video(partial, frames, FPS)
     return f"{out}: {len(frames) / FPS:.0f} s, {'placed' if success else 'not placed'}"
@@ -114,13 +117,12 @@ def check_task(config: CheckTaskConfig) -> str:
 def measure_expert(config: CheckTaskConfig) -> tuple[list[int], list[int]]:
     """Lengths of the demonstrations that succeeded, in steps, and the seeds of those that did not."""
     expert = make_expert(get_task(config.task), config.expert)
-    env = ConstructSkillEnv(config.task, render_backend="none")
     lengths, failures = [], []
-    for seed in Progress(range(DEMO_SEED_START, DEMO_SEED_START + config.states), "expert", unit="state"):
-        frames, success = demonstrate(env, expert, config.noise, seed)
-        if success:
-            lengths.append(len(frames))
-        else:
-            failures.append(seed)
-    env.close()
+    with closing(ConstructSkillEnv(config.task, render_backend="none")) as env:
+        for seed in Progress(range(DEMO_SEED_START, DEMO_SEED_START + config.states), "expert", unit="state"):
+            frames, success = demonstrate(env, expert, config.noise, seed)
+            if success:
+                lengths.append(len(frames))
+            else:
+                failures.append(seed)
     return lengths, failures

@@ -124,7 +124,7 @@ def _row(checkpoint: Path, dataset: "LeRobotDataset", episodes: list[int], confi
         "backbone_precision": getattr(agent.policy.config, "backbone_precision", None),
         "backbone_trained_precision": getattr(getattr(agent.policy, "encoder_record", None), "precision", None),
         "checkpoint": str(checkpoint),
-        "weights_sha256": file_sha256(checkpoint / "model.safetensors"),
+        "weights_sha256": file_sha256(weights) if (weights := checkpoint / "model.safetensors").is_file() else None,
     }
 
 

@@ -251,7 +251,8 @@ def main(name: str, folder: Path, most: int | None) -> None:
         finished, _ = run(scenario, root, kill_at=point)
         assert not finished, f"point {point} was not reached"
         assert run(scenario, root)[0]
-        different = {name for name in expected | tree(root) if expected.get(name) != tree(root).get(name)}
+        found = tree(root)
+        different = {name for name in expected | found if expected.get(name) != found.get(name)}
         assert not different, f"killed before change {point}, these differ: {sorted(different)}"
     print(len(points))
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_constructskill.artifacts import store as module
-from lerobot_constructskill.artifacts.differences import differences, outdated
+from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.differences import _code_now, differences, outdated
 from lerobot_constructskill.artifacts.digests import digest
 from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.store import LOG, SPEC, Machine, Node, Store
@@ -247,6 +248,11 @@ def test_it_is_told_what_differs_from_what_was_made_before(store, monkeypatch):
     assert differences(before, Thing("wrong", (Thing("one", (OTHER,)), OTHER))) == ["name", "one.other"]
     monkeypatch.setitem(CODE, "numpy", "2")
     assert differences(before, Thing("both", (Thing("one"), Thing("other")))) == ["numpy"]
+
+
+def test_a_package_whose_module_has_another_name_is_the_one_that_it_was():
+    code = code_of("yaml")
+    assert code["PyYAML"].partition(", source ")[1] and _code_now("PyYAML", code["PyYAML"]) == code["PyYAML"]
 
 
 def test_a_folder_of_a_store_tells_what_it_was_made_by(store, tmp_path, monkeypatch):

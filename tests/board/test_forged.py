@@ -49,8 +49,9 @@ def test_what_is_wrong_with_it_is_seen_when_it_is_replayed(valid, tmp_path):
             changed = [claim for claim in submission.claims if is_other(claim, before.get(claim.key))]
             for claim in changed or submission.claims[:1]:
                 environment = claim.environment
-                env = envs.setdefault(repr(environment), open_simulator(environment))
-                said = difference(env, claim)
+                key = repr(environment)
+                envs[key] = envs.get(key) or open_simulator(environment)
+                said = difference(envs[key], claim)
                 assert said and "\n" not in said, f"{kind} {number} passes"
     for env in envs.values():
         env.close()
