@@ -140,6 +140,18 @@ class Checked:
         check(self)
 
 
+def seed_of(name: str) -> int:
+    """The training seed that a folder is named after: `seed_0`, `seed_1`, ...
+
+    Raises:
+        InputError: it is of none.
+    """
+    number = name.removeprefix("seed_")
+    if not (name.startswith("seed_") and re.fullmatch("0|[1-9][0-9]{0,9}", number) and allows(Seed, int(number))):
+        raise InputError(f"'{name}' is of no training seed: call it seed_0, seed_1, ..., or move it away.")
+    return int(number)
+
+
 def check(config: Any, of: str = "") -> None:
     """Refuse a dataclass that has a field whose value its annotation does not allow.
 

@@ -15,6 +15,7 @@ import yaml
 from lerobot_constructskill.artifacts.folders import replaced, write_text
 from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
+from lerobot_constructskill.board.recovered import TABLE as RECOVERED
 from lerobot_constructskill.board.submission import SCHEMA, Claim
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
 
@@ -24,6 +25,15 @@ EVAL_INFO, EVAL_RESULTS = "eval_info.json", ".eval_results/constructskill.yaml"
 
 LOST = ("last_step", "last_step_extra", "lost", "is_hopeless")
 """Columns of `recovered.Recovery`, null where an episode placed or was not searched."""
+
+COLUMNS = pa.schema(
+    [
+        *((name, pa.string()) for name in ("entry", "sha256", "suite", "class", "level", "task")),
+        *(SCHEMA.field(name) for name in SCHEMA.names if name != "actions"),
+        *(RECOVERED.schema.field(name).with_nullable(True) for name in LOST),
+    ]
+)
+"""Of the table: the same types whatever entries there are."""
 
 
 def write_table(entries: Iterable[Entry], path: Path) -> None:
@@ -36,14 +46,14 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
             "class": entry.declaration.settings_class,
             "level": entry.level,
             "task": claim.task,
-            **{name: getattr(claim, name) for name in SCHEMA.names if name != "actions"},
+            **{name: getattr(claim, name) for name in SCHEMA.names if name in COLUMNS.names},
             **{name: getattr(entry.recoveries.get(claim.key), name, None) for name in LOST},
         }
         for entry in entries
         for claim in entry.submission.claims
     ]
     with replaced(path) as partial:
-        pq.write_table(pa.Table.from_pylist(rows), partial, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(rows, COLUMNS), partial, compression="zstd")
 
 
 def eval_info(entry: Entry, seed: int) -> dict[str, Any]:

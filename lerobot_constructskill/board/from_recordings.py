@@ -1,7 +1,6 @@
 """Makes a submission from recorded episodes: of a study's runs, or of folders that `$CONSTRUCTSKILL_RECORD` named."""
 
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from lerobot_constructskill.board.declaration import OBSERVES, About
 from lerobot_constructskill.board.protocol import BoardSetting, environment_key
 from lerobot_constructskill.board.recipe import recipe_of, trained_by
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
+from lerobot_constructskill.bounds import seed_of
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_draws, read_environments, read_rows
@@ -31,11 +31,10 @@ def recorded_in(root: Path) -> Recorded:
     """
     recorded = {}
     for folder in sorted(root.glob("seed_*")):
-        if (found := re.fullmatch("seed_(0|[1-9][0-9]{0,8})", folder.name)) is None:
-            raise InputError(f"'{folder}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        seed = seed_of(folder.name)
         # A name that begins with a dot is of a file that was never finished.
         files = sorted(folder.rglob("[!.]*.parquet", case_sensitive=False))
-        recorded[int(found[1])] = [episode for file in files for episode in read_recordings(file)]
+        recorded[seed] = [episode for file in files for episode in read_recordings(file)]
     if not recorded:
         raise MissingError(f"'{root}' has no folder seed_0, seed_1, ... of recordings.")
     return recorded

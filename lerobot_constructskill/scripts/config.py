@@ -21,7 +21,7 @@ class ConfigConfig(Checked):
     One of train/ is first written for a data set, into a file that `lerobot-train` reads.
     """
 
-    name: Text | None = None  # KIND/NAME, KIND is dagger, generate, policy, study or train; default: list all
+    name: Text | None = None  # KIND/NAME, KIND is dagger, generate, plan, policy, study or train; default: list all
     root: Path | None = None  # for train/: the data set's folder
     repo_id: RepoId | None = None  # for train/: its name; without root, of one in LeRobot's cache or on the Hub
     epochs: Count | None = None  # for train/: how often each frame is trained on; default: as the configuration says

@@ -1,15 +1,14 @@
 """`constructskill-push-policy`: upload a checkpoint to the Hub, with its outcomes on its card."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.bounds import Checked, RepoId
+from lerobot_constructskill.bounds import Checked, RepoId, seed_of
 from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED, get_task
 from lerobot_constructskill.dataset.card import render_template
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import MissingError
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import EVALUATED, TRAIN_CONFIG, TRAINED
 from lerobot_constructskill.scripts.console import command
@@ -72,11 +71,10 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     """
     outcomes = {}
     for path in folder.glob("seed_*/eval_info.json"):
-        if not re.fullmatch(r"seed_(0|[1-9][0-9]{0,9})", path.parent.name):
-            raise InputError(f"'{path.parent}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+        seed = seed_of(path.parent.name)
         stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
-        outcomes[int(path.parent.name.removeprefix("seed_"))] = lifted, placed, len(stages)
+        outcomes[seed] = lifted, placed, len(stages)
     if not outcomes:
         raise MissingError(f"{folder} has no seed_*/eval_info.json of lerobot-eval.")
     return [(seed, *counts) for seed, counts in sorted(outcomes.items())]

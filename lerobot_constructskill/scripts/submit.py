@@ -22,7 +22,7 @@ class SubmitConfig:
     """
 
     suite: Suite  # its settings and starts are evaluated
-    about: Path  # YAML: name, submitter, policy, revision, data, training, compute, observes; optional: url and notes
+    about: Path  # YAML: whose it is and how it was trained; docs/leaderboard.md has its fields
     root: Path  # the folder to write
     recorded: Path | None = None  # folder of recordings, with a folder seed_0, seed_1, ... for each training seed
     study: Path | None = None  # or a study's folder

@@ -107,11 +107,10 @@ def test_a_failure_without_finished_parts_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-CONTAINER = """
-import os, sys
+WRITER = """
+import sys
 from pathlib import Path
 from lerobot_constructskill.artifacts.folders import replaced
-os.getpid = lambda: 2**30  # of another container, which has its own numbers and the same name
 with replaced(Path(sys.argv[1])) as partial:
     partial.write_text("theirs")
     print("writing", flush=True)
@@ -119,10 +118,10 @@ with replaced(Path(sys.argv[1])) as partial:
 """
 
 
-def test_a_file_that_another_container_is_writing_is_left_alone(tmp_path):
+def test_a_file_that_another_process_is_writing_is_left_alone(tmp_path):
     path = tmp_path / "rows.txt"
     theirs = subprocess.Popen(
-        [sys.executable, "-c", CONTAINER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", WRITER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert theirs.stdout.readline() == "writing\n"
     with replaced(path) as partial:
@@ -135,7 +134,7 @@ def test_a_file_that_another_container_is_writing_is_left_alone(tmp_path):
 def test_a_file_that_a_killed_process_was_writing_is_removed_by_the_next(tmp_path):
     path = tmp_path / "rows.txt"
     killed = subprocess.Popen(
-        [sys.executable, "-c", CONTAINER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", WRITER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     killed.stdout.readline()
     killed.kill()

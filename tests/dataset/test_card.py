@@ -163,9 +163,6 @@ def test_a_kept_card_is_what_its_facts_render_to(folder):
     card = (folder / "README.md").read_text()
     assert card == render(facts)
     assert all((folder / name).is_file() for name in re.findall(r"\((pictures/\w+\.png)\)", card))
-    generated = CARDS.parent / "outputs" / folder.name / "demonstrations"
-    if generated.is_dir():
-        assert card_facts(open_dataset(generated)) | {"repo_id": facts["repo_id"]} == facts
 
 
 @pytest.mark.slow

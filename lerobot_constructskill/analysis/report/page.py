@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 from urllib.parse import quote
 
-import draccus
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -21,7 +20,7 @@ from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wron
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
-from lerobot_constructskill.parsing import read_fields
+from lerobot_constructskill.parsing import decode, read_fields
 from lerobot_constructskill.presets import find, names
 from lerobot_constructskill.study.rows import (
     KNOWN,
@@ -100,10 +99,9 @@ def read_study(root: Path) -> tuple[str, Analysis, pd.DataFrame]:
     check_folder(root)
     study = STUDY_FILE.read(root / STUDY)
     try:
-        analysis = draccus.decode(Analysis, study.get("analysis") or {})
-    except (InputError, draccus.utils.DecodingError, draccus.utils.ParsingError) as error:
-        reason = error.__cause__ if isinstance(error.__cause__, InputError) else error
-        raise InputError(f"'{root / STUDY}' is not a study's file: {reason}") from None
+        analysis = decode(Analysis, study.get("analysis") or {})
+    except InputError as error:
+        raise InputError(f"'{root / STUDY}' is not a study's file: {error}") from None
     return study["name"], analysis, read_rows(root / ROWS)
 
 
