@@ -23,7 +23,6 @@ from pathlib import Path
 
 from entries import keep, whole, write_whole
 from render import PAGES, render
-from times import Times
 
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.store import Node, Store
@@ -34,6 +33,7 @@ from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.console import Parser, edge, say
 from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
+from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
 from lerobot_constructskill.study.rows import Draws
 from lerobot_constructskill.study.runs import Run
@@ -159,10 +159,10 @@ class Maker:
         left = f"; the others: {times.total()}" if due else ""
         return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made{left}"])
 
-    def times(self) -> Times:
+    def times(self) -> Estimates:
         """How long runs take, by what is in the folders of all studies now."""
         folders = {study: self.folder(study) for study in self.configs}
-        return Times(folders, {name: config.study.episodes for name, config in self.configs.items()}, self.store)
+        return Estimates(folders, {name: config.study.episodes for name, config in self.configs.items()}, self.store)
 
     def is_committed(self, piece: Piece) -> bool:
         """Whether no rows and no entry of its study wait for a commit, as where a process was killed before that."""

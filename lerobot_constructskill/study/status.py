@@ -2,16 +2,16 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 
 from lerobot_constructskill.artifacts.differences import differences, versions_that_differ
 from lerobot_constructskill.artifacts.revisions import BEFORE
 from lerobot_constructskill.artifacts.store import LOG
 from lerobot_constructskill.errors import plural
+from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import seconds_per_run
 
 SHOWN = 3
 """Changes that are named; more are counted."""
@@ -25,13 +25,13 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
         retry_failed: whether it makes failed runs again.
     """
     due = [run for run in chosen if (rows := table.made(run)) is None or (retry_failed and rows[0].error_kind)]
-    lines, took = [], seconds_per_run(table.root)
+    lines, times = [], Estimates({"": table.root}, {"": len(chosen[0].arm.starts)}, table.store)
     for name, alike in groupby(chosen, key=lambda run: run.arm.id):
         runs = list(alike)
         lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
         if own := [run for run in due if run.arm.id == name]:
-            lines.append(f"    to make: {_seeds(own)}, {tell_time(own, took)}")
-    return "\n".join([*lines, _total(table, due, took)])
+            lines.append(f"    to make: {_seeds(own)}, {times.tell('', own)}")
+    return "\n".join([*lines, _total(table, due, times)])
 
 
 def _counts(table: Table, runs: Sequence[Run]) -> str:
@@ -75,25 +75,10 @@ def _seeds(runs: Sequence[Run]) -> str:
     return f"{'seed' if len(runs) == 1 else 'seeds'} {', '.join(str(run.seed) for run in runs)}"
 
 
-def tell_time(runs: Sequence[Run], took: Mapping[str, float]) -> str:
-    """How long runs take, by how long the last ones of their variants took in this folder."""
-    known = [took[run.arm.id] for run in runs if run.arm.id in took]
-    if not known:
-        return "time unknown"
-    return tell_seconds(sum(known)) + (" and some of unknown time" if len(known) < len(runs) else "")
-
-
-def tell_seconds(seconds: float) -> str:
-    """A time in the unit that suits it."""
-    units = ((3600, "h"), (60, "min"), (1, "s"))
-    size, unit = next(one for one in units if seconds >= 1.5 * one[0] or one[0] == 1)
-    return f"about {seconds / size:.0f} {unit}"
-
-
-def _total(table: Table, due: Sequence[Run], took: Mapping[str, float]) -> str:
+def _total(table: Table, due: Sequence[Run], times: Estimates) -> str:
     if not due:
         return "Nothing to make."
     used = {run.arm.demonstrations.name: run.arm.demonstrations for run in due if run.arm.demonstrations}
     absent = [name for name, data in used.items() if not table.store.has(data.node)]
     first = f"; first the demonstrations: {', '.join(absent)}" if absent else ""
-    return f"To make: {plural(len(due), 'run')}, {tell_time(due, took)}{first}"
+    return f"To make: {plural(len(due), 'run')}, {times.total()}{first}"

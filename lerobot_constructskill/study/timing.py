@@ -20,9 +20,6 @@ STAGES = ("demonstrations", "data", "training", "evaluation", "validation")
 """In the order of a study: demonstrations; what policies learn from, made of them (features); checkpoints, with what
 else is made for them, such as rounds of DAgger; episodes; held-out errors."""
 
-OF_A_RUN = STAGES[1:4]
-"""Stages that a study's plan counts for each run. Demonstrations it names apart."""
-
 
 class _Entry(TypedDict):
     arm: str
@@ -63,15 +60,6 @@ def timed(root: Path, arm: str, stage: str, runs: int) -> Iterator[None]:
     entry = {"arm": arm, "stage": stage, "runs": runs, "seconds": round(time.monotonic() - start, 1)}
     with (root / TIMINGS).open("a", encoding="utf-8") as file:  # a short write, which others do not tear
         file.write(json.dumps(entry) + "\n")
-
-
-def seconds_per_run(root: Path) -> dict[str, float]:
-    """What a run of each arm took, trained and evaluated, the last time that some were made."""
-    last: dict[str, dict[str, float]] = defaultdict(dict)
-    for entry in entries(root):
-        if entry["stage"] in OF_A_RUN:
-            last[entry["arm"]][entry["stage"]] = entry["seconds"] / entry["runs"]
-    return {arm: sum(took.values()) for arm, took in last.items() if "evaluation" in took}
 
 
 def time_by_stage(root: Path) -> list[Took]:

@@ -27,7 +27,10 @@ INERT = {
         "progress.py",
         "threads.py",
     ),
-    *(f"study/{name}.py" for name in ("__init__", "plan", "rows", "session", "spec", "status", "table", "timing")),
+    *(
+        f"study/{name}.py"
+        for name in ("__init__", "estimates", "plan", "rows", "session", "spec", "status", "table", "timing")
+    ),
     *("features/__init__.py", "study/validate.py"),  # the latter measures by `rollout`
     *("plans/ifc.py", "plans/picture.py"),
 }

@@ -120,7 +120,7 @@ def test_what_pieces_share_is_counted_with_the_first(checkout, tmp_path, made):
         "tiny/one: 3 runs, about 18 min",  # 600 + 200 + 60 + 8 + 240 s
         "tiny/one/act: 1 run, time unknown",
         "tiny/two: 3 runs, about 4 min",  # 8 + 240 s
-        "0 of 3 pieces made; the others: about 23 min and what is unknown of 1 piece",
+        "0 of 3 pieces made; the others: about 23 min and some of unknown time",
     ]
     store = maker.store
     node = next(run for run in maker.pieces("tiny/one")[0].runs if run.checkpoints).checkpoints.inputs["data"]
@@ -140,7 +140,7 @@ def test_a_piece_is_committed_before_the_next_and_a_clone_makes_the_rest(checkou
     assert maker.status(maker.pieces()).splitlines() == [
         "tiny/one: 3 runs, time unknown",
         "tiny/one/act: 1 run, time unknown",
-        "1 of 3 pieces made; the others: what is unknown of 2 pieces",
+        "1 of 3 pieces made; the others: time unknown",
     ]
     clone = tmp_path / "clone"
     git(tmp_path, "clone", "--quiet", str(checkout), str(clone))

@@ -42,7 +42,7 @@ from lerobot_constructskill.study.session import choose, run_study
 from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.status import status
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import TIMINGS, seconds_per_run, time_by_stage, timed
+from lerobot_constructskill.study.timing import TIMINGS, entries, time_by_stage, timed
 from lerobot_constructskill.study.validate import heldout, list_pairs
 from lerobot_constructskill.training.heldout import FILE
 from lerobot_constructskill.training.recipe import Training
@@ -422,15 +422,14 @@ def test_a_torn_line_of_times_is_left_out(tmp_path):
         file.write('{"arm": "fix{"arm": "fixed/b", "stage": "evaluation", "runs": 1, "seconds": 0.0}\n')
     with timed(tmp_path, "fixed/c", "evaluation", 1):
         pass
-    assert seconds_per_run(tmp_path) == {"fixed/a": 0.0, "fixed/c": 0.0}
+    assert [entry["arm"] for entry in entries(tmp_path)] == ["fixed/a", "fixed/c"]
     assert [(one.stage, one.runs) for one in time_by_stage(tmp_path)] == [("evaluation", 2)]
 
 
-def test_the_time_of_a_stage_is_a_sum_and_that_of_a_run_is_the_last_one(tmp_path):
+def test_the_time_of_a_stage_is_a_sum(tmp_path):
     lines = [("training", 10, 100), ("evaluation", 10, 50), ("training", 2, 30), ("demonstrations", 10, 1000)]
     told = ({"arm": "fixed/a", "stage": stage, "runs": runs, "seconds": took} for stage, runs, took in lines)
     (tmp_path / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in told))
-    assert seconds_per_run(tmp_path) == {"fixed/a": 20.0}, "15 s to train and 5 to evaluate"
     assert [(one.stage, one.runs, one.seconds) for one in time_by_stage(tmp_path)] == [
         ("demonstrations", 10, 1000),
         ("training", 12, 130),
@@ -621,19 +620,18 @@ def test_nothing_is_kept_of_code_that_was_edited_while_it_was_at_work(tmp_path, 
 def test_the_status_tells_what_would_be_made_of_what_is_asked_and_how_long_it_takes(tmp_path):
     runs = list_runs(study())
     table = Table(tmp_path, runs, Store(tmp_path / "store"))
-    with timed(tmp_path, "fixed/a", "evaluation", 2):
-        pass  # what took long ago is not what it takes
-    with (tmp_path / TIMINGS).open("a") as file:
-        file.write(json.dumps({"arm": "fixed/a", "stage": "evaluation", "runs": 2, "seconds": 400}) + "\n")
+    took = {"demonstrations": 300, "data": 100, "training": 100, "evaluation": 400}
+    lines = [{"arm": "fixed/a", "stage": stage, "runs": 2, "seconds": seconds} for stage, seconds in took.items()]
+    (tmp_path / TIMINGS).write_text("".join(f"{json.dumps(line)}\n" for line in lines))
     lines = status(table, runs).splitlines()
     told = dict(zip(lines, lines[1:], strict=False))
-    assert told["fixed/a: 0 finished, 0 failed, 3 missing"] == "    to make: seeds 0, 1, 2, about 10 min"
+    assert told["fixed/a: 0 finished, 0 failed, 3 missing"] == "    to make: seeds 0, 1, 2, about 12 min"
     assert told["fixed/b: 0 finished, 0 failed, 2 missing"] == "    to make: seeds 0, 1, time unknown"
-    assert lines[-1] == "To make: 7 runs, about 10 min and some of unknown time; first the demonstrations: smoke"
+    assert lines[-1] == "To make: 7 runs, about 18 min and some of unknown time; first the demonstrations: smoke"
     assert status(table, choose(runs, "fixed/a/seed_1")).splitlines() == [
         "fixed/a: 0 finished, 0 failed, 1 missing",
-        "    to make: seed 1, about 3 min",
-        "To make: 1 run, about 3 min; first the demonstrations: smoke",
+        "    to make: seed 1, about 9 min",  # 300 + 50 + 200 s
+        "To make: 1 run, about 9 min; first the demonstrations: smoke",
     ]
 
 

@@ -1,4 +1,4 @@
-"""How long the pieces that are left take, by what was made.
+"""How long runs that are to be made will take, by what others took.
 
 It is rough: a variant that was not made in a setting is taken from another setting or study, whose demonstrations may
 be more or longer, and machines differ by a factor of three.
@@ -10,14 +10,12 @@ from pathlib import Path
 from statistics import median
 
 from lerobot_constructskill.artifacts.store import Node, Store
-from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.runs import Run
-from lerobot_constructskill.study.status import tell_seconds
 from lerobot_constructskill.study.timing import entries
 
 
-class Times:
-    """Adds up the times of pieces. What several of them need is counted with the first.
+class Estimates:
+    """Adds up the times of runs. What several of them need is counted with the first.
 
     Args:
         folders: where each study has its rows and times.
@@ -35,24 +33,19 @@ class Times:
                 self._took[study, entry["arm"], entry["stage"]].append(
                     entry["seconds"] / number.get(entry["stage"], 1)
                 )
-        self._known, self._unknown = 0.0, 0
+        self._known, self._is_known = 0.0, True
 
     def tell(self, study: str, runs: Sequence[Run]) -> str:
-        """How long a piece takes: those of its runs that are missing."""
+        """How long it takes to make some runs that are missing."""
         parts = [seconds for run in runs for seconds in self._parts(study, run)]
-        known = sum(seconds for seconds in parts if seconds is not None)
+        known, is_known = sum(seconds for seconds in parts if seconds is not None), None not in parts
         self._known += known
-        if None not in parts:
-            return tell_seconds(known)
-        self._unknown += 1
-        return f"{tell_seconds(known)} and some of unknown time" if known else "time unknown"
+        self._is_known = self._is_known and is_known
+        return _told(known, is_known)
 
     def total(self) -> str:
         """How long all of them take that were told so far."""
-        unknown = f"what is unknown of {plural(self._unknown, 'piece')}"
-        if not self._unknown:
-            return tell_seconds(self._known)
-        return f"{tell_seconds(self._known)} and {unknown}" if self._known else unknown
+        return _told(self._known, self._is_known)
 
     def _parts(self, study: str, run: Run) -> Iterator[float | None]:
         """The seconds of each stage that a run needs and nobody counted before; None where they are unknown."""
@@ -70,11 +63,27 @@ class Times:
         yield None if each is None else len(run.arm.starts) * each
 
     def _each(self, study: str, run: Run, stage: str) -> float | None:
-        """By the same arm, else by the same variant of its study, else by that of any study.
+        """By the same arm, else by the same variant of its study, else of any study; of demonstrations, else by
+        another arm of the setting.
 
         It is the median: work of a killed process is not counted, so some are too short.
         """
-        same = [key for key in self._took if key[1].split("/")[-1] == run.arm.name and key[2] == stage]
-        own = [key for key in same if key[0] == study]
-        keys = [key for key in own if key[1] == run.arm.id] or own or same
+        same = [key for key in self._took if key[2] == stage]
+        alike = [key for key in same if key[1].endswith(f"/{run.arm.name}")]
+        beside = [key for key in same if key[0] == study and key[1].startswith(f"{run.arm.setting}/")]
+        choices = (
+            [key for key in alike if key[:2] == (study, run.arm.id)],
+            [key for key in alike if key[0] == study],
+            alike,
+            beside if stage == "demonstrations" else [],
+        )
+        keys = next(filter(None, choices), [])
         return median(seconds for key in keys for seconds in self._took[key]) if keys else None
+
+
+def _told(known: float, is_known: bool) -> str:
+    """Seconds in the unit that suits them, and whether there are more."""
+    units = ((3600, "h"), (60, "min"), (1, "s"))
+    size, unit = next(one for one in units if known >= 1.5 * one[0] or one[0] == 1)
+    told = f"about {known / size:.0f} {unit}"
+    return told if is_known else f"{told} and some of unknown time" if known else "time unknown"
