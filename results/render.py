@@ -95,6 +95,7 @@ WORDS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "count": lambda arm: arm.met("placed").split("/")[0],
     "each": Arm.in_order,
+    "draws": lambda arm: str(arm.units.nunique()),
 }
 """Of links."""
 
