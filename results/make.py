@@ -60,7 +60,7 @@ STUDIES = (
 SOURCES = ("lerobot_constructskill", "configs")
 """Folders whose uncommitted edits would be in rows, and in no commit that makes these rows again."""
 
-OURS = "frozen_vit"
+TRAINS_TOGETHER = "frozen_vit"
 """The policy type whose seeds train together. One of another type takes long, and is a piece by itself."""
 
 BULKY = ("demonstrations", "features", "rounds", "dagger")
@@ -93,7 +93,7 @@ def pieces_of(name: str, study: Study) -> Iterator[Piece]:
 
     def title(run: Run) -> str:
         parts = [name, run.arm.setting]
-        if run.arm.learner and run.arm.learner.config.type != OURS:
+        if run.arm.learner and run.arm.learner.config.type != TRAINS_TOGETHER:
             parts.append(run.arm.name)
         return "/".join([*parts, f"draw_{draws.of(run.seed)}"] if is_many else parts)
 

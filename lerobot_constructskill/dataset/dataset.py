@@ -82,7 +82,7 @@ class Provenance(TypedDict):
     dagger: NotRequired[Rounds]
 
 
-PROVENANCE = Json("the record of how a data set was made", Provenance)
+ORIGIN = Json("the record of how a data set was made", Provenance)
 
 
 def check_provenance_fields(facts: Provenance) -> None:
@@ -287,7 +287,7 @@ def read_provenance(root: Path) -> Provenance:
             f"{root} has no {SIDECAR}, which says how it was made: only constructskill-generate writes it, and "
             "lerobot-edit-dataset removes it when it deletes, splits or merges."
         )
-    return PROVENANCE.read(root / SIDECAR)
+    return ORIGIN.read(root / SIDECAR)
 
 
 def _tables(root: Path, pattern: str) -> pd.DataFrame:
