@@ -140,16 +140,16 @@ class Checked:
         check(self)
 
 
-def seed_of(name: str) -> int:
+def seed_of(folder: Path) -> int:
     """The training seed that a folder is named after: `seed_0`, `seed_1`, ...
 
     Raises:
         InputError: it is of none.
     """
-    number = name.removeprefix("seed_")
-    if not (name.startswith("seed_") and re.fullmatch("0|[1-9][0-9]{0,9}", number) and allows(Seed, int(number))):
-        raise InputError(f"'{name}' is of no training seed: call it seed_0, seed_1, ..., or move it away.")
-    return int(number)
+    found = re.fullmatch("seed_(0|[1-9][0-9]{0,9})", folder.name)
+    if found is None or not allows(Seed, int(found[1])):
+        raise InputError(f"'{folder}' is of no training seed: name it seed_0, seed_1, ..., or move it away.")
+    return int(found[1])
 
 
 def check(config: Any, of: str = "") -> None:

@@ -50,7 +50,7 @@ class Arm:
         if self.rows.empty:
             raise SystemExit(f"A page names {name}, which its study does not have.")
         self.runs = runs_of(self.rows)
-        self.units = self.runs["training_seed"].map(draws.unit)
+        self.draws, self.units = (self.runs["training_seed"].map(of) for of in (draws.of, draws.unit))
 
     def tell(self, number: Callable[["Arm"], str]) -> str:
         return "not run yet" if self.runs.empty else number(self)
@@ -95,7 +95,7 @@ WORDS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "count": lambda arm: arm.met("placed").split("/")[0],
     "each": Arm.in_order,
-    "draws": lambda arm: str(arm.units.nunique()),
+    "draws": lambda arm: str(arm.draws.nunique()),
 }
 """Of links."""
 

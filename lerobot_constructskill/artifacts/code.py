@@ -104,6 +104,11 @@ def _distribution(package: str) -> str | None:
     return next(iter(_distributions().get(package, ())), package if installed(package) else None)
 
 
+def modules_of(distribution: str) -> list[str]:
+    """The top-level packages of a distribution, or what is called so itself."""
+    return [package for package, owners in _distributions().items() if distribution in owners] or [distribution]
+
+
 _distributions = cache(packages_distributions)
 
 

@@ -1,11 +1,10 @@
 """Finds what has changed since a node was made: names of packages and rooms, places of settings."""
 
 from collections.abc import Iterator, Mapping
-from importlib.metadata import packages_distributions
 from pathlib import Path
 from typing import Any
 
-from lerobot_constructskill.artifacts.code import code_of
+from lerobot_constructskill.artifacts.code import code_of, modules_of
 from lerobot_constructskill.artifacts.digests import installed
 from lerobot_constructskill.artifacts.revisions import EDITED, PREFIX, read_table, revision
 from lerobot_constructskill.artifacts.store import INPUTS, LINEAGE, SPEC, SPECIFICATION, VERSIONS, Node
@@ -71,5 +70,4 @@ def _code_now(name: str, before: str) -> str | None:
         return room and revision(room)
     if "source " not in before:
         return installed(name)
-    modules = [module for module, owners in packages_distributions().items() if name in owners]
-    return code_of(*modules).get(name)
+    return code_of(*modules_of(name)).get(name)

@@ -31,7 +31,7 @@ def recorded_in(root: Path) -> Recorded:
     """
     recorded = {}
     for folder in sorted(root.glob("seed_*")):
-        seed = seed_of(folder.name)
+        seed = seed_of(folder)
         # A name that begins with a dot is of a file that was never finished.
         files = sorted(folder.rglob("[!.]*.parquet", case_sensitive=False))
         recorded[seed] = [episode for file in files for episode in read_recordings(file)]
@@ -104,10 +104,10 @@ def with_draws(about: About, study: Path) -> About:
     """What is said of a policy, with what its study's folder says of its demonstrations.
 
     Raises:
-        InputError: the two contradict each other, or some seeds share a draw and others do not.
+        InputError: the two contradict each other, or there are several draws of several seeds each.
     """
     draws = read_draws(study)
-    if draws.groups_seeds:
+    if draws.groups_seeds and about.is_policy:
         raise InputError(
             f"Of the study, {draws.seeds_a_draw} training seeds share a draw of demonstrations; the seeds of an entry "
             "learn from one draw, or each from its own."

@@ -12,6 +12,7 @@ from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
     Side,
     Source,
+    are_apart,
     check_equal,
     conditions,
     read,
@@ -107,15 +108,15 @@ def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:
     Raises:
         InputError: of one side seeds have starts of their own, and the other side has not the same.
     """
-    each = [side.starts_apart for side in known]
-    if not any(each):
+    each = [side.starts_of_each for side in known]
+    if len(each) == 2 and len(each[0]) == len(each[1]):
+        pairs = [*zip(*each, strict=True)]
+        merged = [a or b for a, b in pairs]
+        if are_apart(merged) and all(a == b for a, b in pairs if a and b):
+            return merged
+    own = next((side for side in known if are_apart(side.starts_of_each)), None)
+    if own is None:
         return None
-    apart = [starts for starts in each if starts]
-    if len(apart) == 2 and len(apart[0]) == len(apart[1]):
-        pairs = [*zip(*apart, strict=True)]
-        if all(a == b for a, b in pairs if a and b):
-            return [a or b for a, b in pairs]
-    own = next(side for side, starts in zip(known, each, strict=True) if starts)
     raise InputError(
         f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose training "
         "seeds have the same ones."

@@ -71,7 +71,7 @@ class Side:
         return self.draws.covered if self.draws else None
 
     def units(self, rates: Sequence[float]) -> np.ndarray:
-        """The rates that a comparison counts: of each training seed or, where draws have own data, of each draw."""
+        """The rates that a comparison counts: of each training seed, or of each draw if draws differ in data."""
         return by_unit(rates, [*map(self.draws.unit, self.numbers)]) if self.draws else np.array(rates)
 
     @property
@@ -80,18 +80,26 @@ class Side:
         return "draw" if self.draws and self.draws.groups_seeds else "seed"
 
     @property
-    def starts_apart(self) -> list[set[int]] | None:
-        """Starts of each seed, empty if it failed, where no two draws share any; None where some are shared."""
-        each = [set(placed or ()) for placed in self.seeds]
-        different = {frozenset(starts) for starts in each if starts}
-        apart = len(different) > 1 and sum(map(len, different)) == len(set.union(*each))
-        return each if apart and len({*map(len, different)}) == 1 else None
+    def starts_of_each(self) -> list[set[int]]:
+        """Starts of each seed, none for one that failed."""
+        return [set(placed or ()) for placed in self.seeds]
 
     @property
     def starts(self) -> set[int] | None:
         """Starts that all training seeds were evaluated from; None if every seed failed."""
         finished = [set(placed) for placed in self.seeds if placed is not None]
         return set.intersection(*finished) if finished else None
+
+
+def are_apart(each: Sequence[set[int]]) -> bool:
+    """Whether seeds have starts in which no two draws share any.
+
+    Args:
+        each: starts of each seed; none for one that failed.
+    """
+    different = {frozenset(starts) for starts in each if starts}
+    is_apart = len(different) > 1 and sum(map(len, different)) == len(set.union(*each))
+    return is_apart and len({*map(len, different)}) == 1
 
 
 def conditions(env: Mapping[str, Any]) -> dict[str, Any]:

@@ -40,7 +40,9 @@ def tell(matched: MatchedSides | OverTasks, alpha: float) -> str:
 def _over_tasks(over: OverTasks, alpha: float) -> str:
     """The output for several tasks: each in a line, then the mean over tasks of every seed."""
     one = next(iter(over.tasks.values()))
-    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", "", f"{'':24}{'A, mean of seeds':<18}B, mean of seeds"]
+    unit = _unit(one)
+    head = f"{'':24}{f'A, mean of {unit}s':<18}B, mean of {unit}s"
+    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", "", head]
     for name, matched in over.tasks.items():
         lines.append(f"{name:<24}{matched.judgement.mean_a.value:<18.1%}{matched.judgement.mean_b.value:.1%}")
     means = over.judgement.mean_a, over.judgement.mean_b
@@ -48,11 +50,10 @@ def _over_tasks(over: OverTasks, alpha: float) -> str:
     lines += [f"{'mean over tasks':<24}{shares[0]:<18}  {shares[1]}", ""]
     for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
         lines.append(f"{letter}, mean over tasks of each seed, %: {' '.join(f'{100 * rate:.0f}' for rate in rates)}")
-    unit = _unit(one)
     told = _conclusion(over.judgement, alpha, unit), _power(over.judgement, alpha, unit)
     paragraphs = ("\n".join(lines), *told, _covered(one))
     return "\n\n".join(
-        [*filter(None, paragraphs), "Each seed counts once; episodes of different tasks are not pooled."]
+        [*filter(None, paragraphs), f"Each {unit} counts once; episodes of different tasks are not pooled."]
     )
 
 
@@ -119,15 +120,16 @@ def _conclusion(judgement: Judgement, alpha: float, unit: str) -> str:
 def _power(judgement: Judgement, alpha: float, unit: str) -> str:
     """What so many seeds or draws can and cannot show."""
     a, b = judgement.counts_a.seeds, judgement.counts_b.seeds
-    if max(a, b) == 1 and unit == "seed":
+    more = f"{'Train' if unit == 'seed' else 'Make'} more {unit}s"
+    if max(a, b) == 1:
         return (
-            "One training seed a side tells how these two checkpoints do, and nothing of their policies: another seed "
-            "of either may do anything. Train more seeds of both."
+            f"One {'training seed' if unit == 'seed' else unit} a side tells how these checkpoints do, and nothing of "
+            f"their policies: another {unit} of either may do anything. {more} of both."
         )
     if judgement.smallest_p_value >= alpha:
         return (
             f"{plural(a, unit)} against {b} can show no difference, however large: their p-value is at least "
-            f"{judgement.smallest_p_value:.2g}. Train more {unit}s."
+            f"{judgement.smallest_p_value:.2g}. {more}."
         )
     visible = judgement.visible
     if visible is None:
@@ -146,6 +148,8 @@ def _power(judgement: Judgement, alpha: float, unit: str) -> str:
 def _covered(matched: MatchedSides) -> str:
     """What the intervals are over, and that the sides differ in it."""
     a, b = matched.a.covered, matched.b.covered
+    if matched.a.unit != matched.b.unit:
+        a, b = (f"{side.covered}, a unit is a {side.unit}" for side in (matched.a, matched.b))
     if a == b:
         return f"The intervals hold for {a}." if a else ""
     told = {letter: f"{letter}'s interval holds for {one}." for letter, one in (("A", a), ("B", b)) if one}

@@ -71,7 +71,7 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
     """
     outcomes = {}
     for path in folder.glob("seed_*/eval_info.json"):
-        seed = seed_of(path.parent.name)
+        seed = seed_of(path.parent)
         stages = [reward for task in EVALUATED.read(path)["per_task"] for reward in task["metrics"]["max_rewards"]]
         lifted, placed = (sum(stage >= reward for stage in stages) for reward in (REWARD_LIFTED, REWARD_PLACED))
         outcomes[seed] = lifted, placed, len(stages)

@@ -30,9 +30,8 @@ class Estimates:
         for study, folder in folders.items():
             for entry in entries(folder):  # of a set and its features, of a seed, of an episode
                 number = {"training": entry["runs"], "evaluation": entry["runs"] * episodes[study]}
-                self._took[study, entry["arm"], entry["stage"]].append(
-                    entry["seconds"] / number.get(entry["stage"], 1)
-                )
+                each = number.get(entry["stage"], entry.get("nodes", 1))
+                self._took[study, entry["arm"], entry["stage"]].append(entry["seconds"] / each)
         self._known, self._is_known = 0.0, True
 
     def tell(self, study: str, runs: Sequence[Run]) -> str:
@@ -56,7 +55,7 @@ class Estimates:
             nodes |= {"data": run.checkpoints.inputs["data"], "training": run.checkpoints}
         for stage, node in nodes.items():
             once = (node, run.seed) if stage == "training" else node  # seeds that train together are one node
-            if not self._store.has(node) and once not in self._counted:
+            if not (node.is_passing or self._store.has(node)) and once not in self._counted:
                 self._counted.add(once)
                 yield self._each(study, run, stage)
         each = self._each(study, run, "evaluation")

@@ -76,12 +76,12 @@ class Draws:
         return seed // self.seeds_a_draw if self.demonstrations == OWN else 0
 
     def unit(self, seed: int) -> int:
-        """What of a training seed is independent of the others: the seed itself, or its draw where each is own."""
+        """What counts once: a training seed, or its draw of demonstrations where there are several."""
         return self.of(seed) if self.demonstrations == OWN else seed
 
     @property
     def groups_seeds(self) -> bool:
-        """Whether there are several draws, each of several training seeds."""
+        """Whether there are several draws of demonstrations, each for several training seeds."""
         return self.demonstrations == OWN and self.seeds_a_draw > 1
 
     @property

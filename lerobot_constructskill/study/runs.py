@@ -204,8 +204,9 @@ def _lost(job: Job, stage: str, nodes: Mapping[Run, Node]) -> dict[Run, Failure]
     due = {run: node for run, node in nodes.items() if not (node.is_passing or job.store.has(node))}
     if not due:
         return {}
-    with timed(job.times, next(iter(due)).arm.id, stage, len(due)):
-        failed = job.store.get_all([*due.values()], job.machine)
+    different = [*dict.fromkeys(due.values())]
+    with timed(job.times, next(iter(due)).arm.id, stage, len(due), len(different)):
+        failed = job.store.get_all(different, job.machine)
     return {run: failed[node] for run, node in due.items() if node in failed}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypedDict
+from typing import Annotated, NotRequired, TypedDict
 
 from annotated_types import Ge, Lt
 
@@ -25,6 +25,7 @@ class _Entry(TypedDict):
     arm: str
     stage: str
     runs: Annotated[int, Ge(1)]
+    nodes: NotRequired[Annotated[int, Ge(1)]]
     seconds: Annotated[float, Ge(0), Lt(1e9)]
 
 
@@ -47,17 +48,19 @@ class Took:
 
 
 @contextmanager
-def timed(root: Path, arm: str, stage: str, runs: int) -> Iterator[None]:
+def timed(root: Path, arm: str, stage: str, runs: int, nodes: int = 1) -> Iterator[None]:
     """Note how long the block takes; work of a killed process is not counted.
 
     Args:
         arm: setting/variant of the runs that it is for.
         stage: one of `STAGES`.
         runs: how many.
+        nodes: how many data sets or features they share.
     """
     start = time.monotonic()
     yield
     entry = {"arm": arm, "stage": stage, "runs": runs, "seconds": round(time.monotonic() - start, 1)}
+    entry |= {"nodes": nodes} if nodes > 1 else {}
     with (root / TIMINGS).open("a", encoding="utf-8") as file:  # a short write, which others do not tear
         file.write(json.dumps(entry) + "\n")
 

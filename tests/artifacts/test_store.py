@@ -250,9 +250,13 @@ def test_it_is_told_what_differs_from_what_was_made_before(store, monkeypatch):
     assert differences(before, Thing("both", (Thing("one"), Thing("other")))) == ["numpy"]
 
 
-def test_a_package_whose_module_has_another_name_is_the_one_that_it_was():
-    code = code_of("yaml")
-    assert code["PyYAML"].partition(", source ")[1] and _code_now("PyYAML", code["PyYAML"]) == code["PyYAML"]
+@pytest.mark.parametrize(("name", "module"), [("PyYAML", "yaml"), ("written_by_hand", "written_by_hand")])
+def test_a_package_is_found_by_its_distribution_or_its_own_name(name, module, tmp_path, monkeypatch):
+    """An editable installation may list no packages."""
+    (tmp_path / "written_by_hand.py").write_text("HERE = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    code = code_of(module)[name]
+    assert "source " in code and _code_now(name, code) == code
 
 
 def test_a_folder_of_a_store_tells_what_it_was_made_by(store, tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from markupsafe import escape
 from lerobot_constructskill.board import films, verification
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.explained import meaning
-from lerobot_constructskill.board.exports import eval_info, write_exports
+from lerobot_constructskill.board.exports import eval_info, write_exports, write_table
 from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, BoardSetting
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
@@ -98,6 +98,9 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
         assert {link[1:] for link in page.found["href"] if link.startswith("#")} <= page.found["id"]
     table = pq.read_table(tmp_path / "board.parquet")
     assert table.num_rows == sum(len(entry.submission.claims) for entry in entries)
+    for few in ([], [entry for entry in entries if entry.is_reference][:1]):
+        write_table(few, tmp_path / "few.parquet")
+        assert pq.read_schema(tmp_path / "few.parquet").equals(table.schema), "whatever entries there are"
 
 
 @pytest.mark.nightly

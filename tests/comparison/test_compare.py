@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.comparison.match import Asked, MatchedSides, match
-from lerobot_constructskill.comparison.sides import Side, conditions, find, read_study
+from lerobot_constructskill.comparison.sides import Side, are_apart, conditions, find, read_study
 from lerobot_constructskill.comparison.tell import tell
 from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.envs.recording import Episode
@@ -44,7 +44,7 @@ def test_every_published_study_has_a_variant_that_can_be_compared_with():
         arms = read_rows(folder / "rows.parquet").query("role == 'variant' and placed.notna()")
         side = read_study(folder, f"{arms['setting'].iloc[0]}/{arms['variant'].iloc[0]}")
         assert conditions(side.env)["task"] in TASKS and "lerobot" in side.versions, folder
-        assert side.starts or side.starts_apart, folder
+        assert side.starts or are_apart(side.starts_of_each), folder
 
 
 def test_a_failed_training_seed_counts_as_one_that_did_not_place_and_a_missing_one_not_at_all(study):
@@ -119,6 +119,8 @@ def test_a_failed_seed_whose_draw_has_starts_of_its_own_placed_nothing(study):
     comparison = compared(study([9, None, 8, 7], draws=own), study([5, 5, 5, 5], "other", draws=own))
     assert comparison.rates_a == [0.9, 0.0, 0.8, 0.7] and len(comparison.starts) == 40
     assert "starts 1000 to 1039 (40, 10 a draw)" in tell(comparison, 0.05)
+    two = compared(study([9, None], "two", draws=own), study([5, 5], "both", draws=own))
+    assert two.rates_a == [0.9, 0.0] and len(two.starts) == 20
 
 
 def test_seeds_of_one_draw_count_as_one(study):
@@ -127,7 +129,11 @@ def test_seeds_of_one_draw_count_as_one(study):
     judgement = compared(pairs, other).judgement
     told = tell(compared(pairs, other), 0.05)
     assert "draws that placed" in told and "permutation of draws" in told
-    assert "units that placed" in tell(compared(pairs, study([5] * 6, "of one draw")), 0.05)
+    mixed = tell(compared(pairs, study([5] * 6, "of one draw")), 0.05)
+    assert "units that placed" in mixed and "a unit is a draw" in mixed and "a unit is a seed" in mixed
+    assert "Make more draws of both." in tell(
+        compared(study([9, 7], "a", draws=draws), study([1, 2], "b", draws=draws)), 0.05
+    )
     (unfinished,) = {compared(study([9, 7], "of one", draws=draws), other).judgement.counts_a.seeds}
     assert unfinished == 1, "one draw is one draw, also where no other has been run yet"
     assert (judgement.counts_a.seeds, judgement.mean_a.value) == (3, pytest.approx(0.5))
@@ -197,7 +203,7 @@ def test_the_text_names_sides_versions_and_what_so_many_seeds_cannot_say(study, 
     assert "They differ in torch (torch_1 and torch_2)." in told
     assert "Both were made with lerobot 0.6.1; processor a CPU." in told
     one = compare(CompareConfig(recorded(GOOD[:1]), study(BAD[:1])))
-    assert "One training seed a side tells how these two checkpoints do, and nothing of their policies" in one
+    assert "One training seed a side tells how these checkpoints do, and nothing of their policies" in one
     assert "This number of seeds does not show which of them is better." in one
     assert "torch (" in one.partition("They differ in ")[2]
     assert "lerobot (unknown and 0.6.1); processor (unknown and a CPU)" in one

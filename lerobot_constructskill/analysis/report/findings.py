@@ -17,7 +17,8 @@ class Success(NamedTuple):
     """How often one variant met one criterion.
 
     Args:
-        counts: seeds that met it in at least one episode; here and below draws, where each has its own demonstrations.
+        counts: seeds that met it in at least one episode. Where there are several draws of demonstrations, these stand
+            for seeds, here and below.
         exact: share of those seeds with Clopper-Pearson's interval.
         mean: share of episodes, averaged over seeds, with Gaffke's interval.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].

@@ -215,9 +215,12 @@ def _correlations(
     variants: list[VariantFindings], ordered: list[VariantFindings]
 ) -> list[tuple[str, dict[str, Correlation | None]]]:
     def correlate(runs: pd.DataFrame) -> dict[str, Correlation | None]:
-        error, variant = runs["heldout_mse_m2"].to_numpy(), runs["variant"].to_numpy()
-        rates = {name: runs[f"{name}_rate"].to_numpy() for name in CRITERIA}
-        return {name: kendall(error, of, variant, np.random.default_rng(0)) for name, of in rates.items()}
+        columns = ["heldout_mse_m2", *(f"{name}_rate" for name in CRITERIA)]
+        units = runs.groupby(["variant", "unit"], sort=False)[columns].mean().reset_index()
+        error, *rates = (units[column].to_numpy() for column in columns)
+        variant = units["variant"].to_numpy()
+        found = (kendall(error, of, variant, np.random.default_rng(0)) for of in rates)
+        return dict(zip(CRITERIA, found, strict=True))
 
     # Two variants of the same checkpoints, evaluated differently, would count a seed's error twice.
     different = {

@@ -40,7 +40,7 @@ def kendall(
 
     Args:
         error: held-out error of each run, (runs,); runs without one (nan) are left out.
-        success: episodes that met the criterion, (runs,).
+        success: share of its episodes that met the criterion, (runs,).
         variant: name of the variant of each run, (runs,).
         rng: source of the resamples.
         level: level of the interval.
