@@ -53,7 +53,7 @@ endif
 mutants: setup ## sixty drawn edits of the package, each against the tests that reach it
 	.venv/bin/python tests/mutants.py
 
-bench: setup ## every speed claim, measured side by side on this machine, into benchmarks/RESULTS.md
+bench: setup ## the speed claims of docs/speed.md but those marked ‡, side by side on this machine, into benchmarks/RESULTS.md
 	.venv/bin/python benchmarks/run.py
 
 dist: setup ## the wheel and the source distribution, into dist/

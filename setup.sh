@@ -72,7 +72,7 @@ fill_venv() {
     [[ ! -t 2 ]] || quiet= # on a terminal uv shows how far it is
     has_python || uv venv --quiet --clear --seed --python '>=3.12,<3.14' .venv ||
         uv venv --quiet --clear --seed --python 3.12 --managed-python .venv
-    ln -sf "$(command -v uv)" .venv/bin/uv # for whoever enters .venv and installs a plugin
+    ln -sf "$(readlink -f "$(command -v uv)")" .venv/bin/uv # for whoever enters .venv and installs a plugin
     uv pip install $quiet --compile-bytecode --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]"
     uv pip install $quiet --python .venv/bin/python --no-deps $MOBILENET || say "no weights of mobilenet_v2"
 }

@@ -6,7 +6,7 @@ machine to machine. When all of it is there, the entry is written and replayed, 
 
 import json
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -98,18 +98,19 @@ def whole(folder: Path, study: str) -> list[str]:
     return [name for name, entry in of(study).items() if entry.is_whole(folder)]
 
 
-def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]:
-    """Write the entries of a study that can be written, and remove their recordings; return which were.
+def write_entries(names: Sequence[str], folder: Path, study: str, board: Path, commit: str) -> list[str]:
+    """Write entries that are made of a study, and return those that were written.
 
     An entry says of itself what the one before it said, but for the commit and the processors. It is replayed. What
     was found of when the episodes of the one before were lost is removed. One that is refused, as its runs are of
     different makes of processors or end otherwise, stays as it was, and the reason is printed.
 
     Args:
-        commit: that has the entry's rows.
+        names: some that `whole` returns.
+        commit: that has the entries' rows.
     """
     own, written = of(study), []
-    for name in whole(folder, study):
+    for name in names:
         root = board / "entries" / name
         with TemporaryDirectory(dir=board) as scratch:
             made = Path(scratch) / name
@@ -123,8 +124,12 @@ def write_whole(folder: Path, study: str, board: Path, commit: str) -> list[str]
             made.rename(root)
         (board / "recovered" / f"{name}.parquet").unlink(missing_ok=True)
         written.append(name)
-    _remove_others(folder, [own[name] for name in own.keys() - {*written}])
     return written
+
+
+def drop(folder: Path, study: str, names: Sequence[str]) -> None:
+    """Remove from a study's folder the recordings of some entries that no other one needs."""
+    _remove_others(folder, [entry for name, entry in of(study).items() if name not in names])
 
 
 def _remove_others(folder: Path, entries: Iterable[Part]) -> None:

@@ -20,8 +20,9 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from entries import keep, whole, write_whole
+from entries import drop, keep, whole, write_entries
 from render import PAGES, render
 
 from lerobot_constructskill.artifacts.folders import write_text
@@ -35,7 +36,7 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import Draws
+from lerobot_constructskill.study.rows import ROWS, Draws, Row, load_rows
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
@@ -114,7 +115,7 @@ class Maker:
 
     def __init__(self, root: Path, store: Path, studies: Sequence[str] = STUDIES, **options):
         self.root, self.store, self.options = root, Store(store.absolute()), options
-        self._refused: set[str] = set()  # studies of which an entry was refused
+        self._refused: set[str] = set()  # entries of the board, in this process
         self.configs = {name: parse(StudyConfig, [], find("study", name)) for name in studies}
 
     def folder(self, study: str) -> Path:
@@ -165,10 +166,35 @@ class Maker:
         return Estimates(folders, {name: config.study.episodes for name, config in self.configs.items()}, self.store)
 
     def is_committed(self, piece: Piece) -> bool:
-        """Whether no rows and no entry of its study wait for a commit, as where a process was killed before that."""
+        """Whether its rows are in a commit, and no entry of its study waits to be written.
+
+        They are not where a process was killed before that.
+        """
         folder = self.folder(piece.study)
-        waits = whole(folder, piece.study) and piece.study not in self._refused
-        return not waits and not self._git("status", "--porcelain", "--", folder)
+        if self._due_entries(piece.study):
+            return False
+        if not self._git("status", "--porcelain", "--", folder):
+            return True
+        names = {(run.arm.setting, run.arm.name, run.seed) for run in piece.runs}
+        now, before = (
+            [row for row in rows if (row.setting, row.variant, row.training_seed) in names]
+            for rows in (load_rows(folder / ROWS), self._committed(folder / ROWS))
+        )
+        return now == before
+
+    def _due_entries(self, study: str) -> list[str]:
+        return [name for name in whole(self.folder(study), study) if name not in self._refused]
+
+    def _committed(self, file: Path) -> list[Row]:
+        """The rows of a study in the last commit."""
+        name = file.relative_to(self.root).as_posix()
+        if not self._git("ls-tree", "HEAD", "--", file):
+            return []
+        with TemporaryDirectory() as scratch:
+            copy = Path(scratch) / file.name
+            command = ["git", "-C", self.root, "show", f"HEAD:{name}"]
+            copy.write_bytes(subprocess.run(command, check=True, capture_output=True).stdout)
+            return load_rows(copy)
 
     def make(self, piece: Piece) -> None:
         """Make what is missing of a piece, write its pages and commit them.
@@ -203,10 +229,17 @@ class Maker:
         _remove_unseen(folder / "figures", self._pages)
         keep(folder, piece.study, piece.runs, self.store)
         self._commit(f"Results: {piece.name}", folder, *self._pages)
-        if entries := write_whole(folder, piece.study, board, self._git("rev-parse", "--short", "HEAD").strip()):
-            self._commit(f"Board: {', '.join(entries)}", folder, board)
-        if whole(folder, piece.study):
-            self._refused.add(piece.study)
+        due, commit = self._due_entries(piece.study), self._git("rev-parse", "--short", "HEAD").strip()
+        for name in due:  # a process may have been killed while it replaced one
+            if not (board / "entries" / name).exists():
+                self._git("checkout", "HEAD", "--", board / "entries" / name)
+        written = write_entries(due, folder, piece.study, board, commit)
+        self._refused |= {*due} - {*written}
+        if written:
+            kept = (board / name for name in ("entries", "recovered", "verified"))
+            self._commit(f"Board: {', '.join(written)}", *filter(Path.exists, kept))
+            drop(folder, piece.study, written)
+            self._commit(f"Recordings of {', '.join(written)} are on the board", folder)
 
     @property
     def _pages(self) -> list[Path]:
@@ -269,10 +302,13 @@ def main() -> None:
         if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
             say(f"Stopped before {piece.name}; the same command continues there")
             return
-        say(f"{piece.name}: {plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}")
+        told = f"{plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}" if runs else "to be committed"
+        say(f"{piece.name}: {told}")
         maker.make(piece)
         if asked.discard:
             maker.discard()
+    if asked.discard:
+        maker.discard()
     say("All is made")
 
 

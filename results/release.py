@@ -90,6 +90,8 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
     """
     if not (site / "index.html").is_file():
         raise MissingError(f"{site} has no index.html: `make docs` builds the site.")
+    if out.exists() and not (out / FILE).is_file():
+        raise TakenError(f"{out} exists already, and is no release: move it away.")
     release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}")
     sets = {
         name: Demonstrations(parse_named(GenerateConfig, "generate", name, ["--repo_id=local/set"])) for name in SETS
@@ -98,7 +100,7 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
     sets |= {data: own[0].arm.demonstrations.node for data, own in runs.items()}
     made = {name: store.get(node, machine) for name, node in sets.items()}
     policies = {data: _Policies(study, runs[data], store, machine) for data, (study, _) in POLICIES.items()}
-    if (out / FILE).is_file():  # an earlier one
+    if out.exists():
         shutil.rmtree(out)
     with staged(out) as folder:
         for name, data in made.items():
@@ -152,7 +154,7 @@ class _Policies:
 
 
 def push(out: Path) -> None:
-    """Upload a release; what is on the Hub already in this version stays.
+    """Upload a release; what is on the Hub already in this version stays, files of earlier versions go.
 
     Raises:
         MissingError: none was written.

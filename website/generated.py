@@ -98,7 +98,8 @@ def policies(root: Path) -> dict[str, list[str]]:
         envs, runs = read_environments(folder), runs_of(rows[rows["error_kind"].isna()])
         for (setting, variant), own in runs.groupby(["setting", "variant"]):
             lifted, placed = ("{}/{}".format(*count(own[f"{criterion}_rate"])) for criterion in ("lifted", "placed"))
-            policy = analysis.label(variant) + (f", {analysis.label(setting)}" if envs[setting].get("perturb") else "")
+            perturbed = envs[setting].get("perturb")
+            policy = analysis.label(variant) + (f", `{perturbed}`" if perturbed else "")
             cells = (policy, lifted, placed, f"{own['placed'].sum()}/{own['episodes'].sum()}")
             link = f"[{name}](../../results/{folder.name}/report.md)"
             outcomes[envs[setting]["task"]].append(f"| {' | '.join(cells)} | {link} |")
