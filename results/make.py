@@ -192,7 +192,7 @@ class Maker:
             return []
         with TemporaryDirectory() as scratch:
             copy = Path(scratch) / file.name
-            command = ["git", "-C", self.root, "show", f"HEAD:{name}"]
+            command = ["git", "-C", str(self.root), "show", f"HEAD:{name}"]
             copy.write_bytes(subprocess.run(command, check=True, capture_output=True).stdout)
             return load_rows(copy)
 
