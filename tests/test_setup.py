@@ -132,6 +132,7 @@ def test_a_machine_without_uv_gets_its_own(machine):
     status, _, calls = machine()
     assert status == 0 and "pip install --quiet --disable-pip-version-check uv" in calls
     assert any(call.startswith(PIP) for call in calls)
+    assert (machine.folder / ".venv" / "bin" / "uv").is_file(), "whoever enters .venv finds it"
 
 
 def test_a_machine_without_a_fitting_python_is_given_one_by_uv(machine):
