@@ -17,7 +17,7 @@ from lerobot_constructskill.contract import PLANNED
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.files import Yaml
 from lerobot_constructskill.presets import names
-from lerobot_constructskill.study.rows import STUDY
+from lerobot_constructskill.study.rows import STUDY, merged
 
 KEPT = ("name", "training", "demonstrations", "starts", "seeds_a_draw", "episodes", "eval_seed")
 """Fields of a study that its recipe takes as they are."""
@@ -104,22 +104,9 @@ def _split(text: str) -> list[str]:
 def trained_by(rows: pd.DataFrame, settings: Mapping[str, str], seeds: Sequence[int]) -> dict[str, Any]:
     """What the rows of a study's variant say of its training: fields of `Trained` without the recipe's hash."""
     weights = {name: [_weights(rows, theirs, seed) for seed in seeds] for name, theirs in settings.items()}
-    return {"weights": weights, "made_with": made_with(rows["versions"].dropna().unique())}
+    return {"weights": weights, "made_with": merged(map(json.loads, rows["versions"].dropna().unique()))}
 
 
 def _weights(rows: pd.DataFrame, setting: str, seed: int) -> str | None:
     own = rows[(rows["setting"] == setting) & (rows["training_seed"] == seed)]["weights_sha256"].dropna()
     return None if own.empty else str(own.iloc[0])
-
-
-def made_with(versions: Sequence[str]) -> dict[str, str]:
-    """The packages, rooms and processors of several rows; where they differ, all of them.
-
-    Args:
-        versions: JSON, as rows have it.
-    """
-    found: dict[str, set[str]] = {}
-    for text in versions:
-        for name, version in json.loads(text).items():
-            found.setdefault(name, set()).add(str(version))
-    return {name: ", ".join(sorted(found[name])) for name in sorted(found)}

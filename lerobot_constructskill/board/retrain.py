@@ -1,5 +1,6 @@
 """The level retrained: an entry's recipe makes demonstrations, features and policies again, and these are compared."""
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from lerobot_constructskill.artifacts.revisions import PREFIX
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.board.declaration import Trained
 from lerobot_constructskill.board.protocol import BoardSetting, environment_key
-from lerobot_constructskill.board.recipe import made_with, read_recipe
+from lerobot_constructskill.board.recipe import read_recipe
 from lerobot_constructskill.board.rerun import confirm, describe
 from lerobot_constructskill.board.submission import Claim, Submission
 from lerobot_constructskill.board.verification import different
@@ -21,7 +22,7 @@ from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import decode
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import Row
+from lerobot_constructskill.study.rows import Row, merged
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
@@ -128,7 +129,7 @@ def _check_runs(submission: Submission, study: Study, runs: Sequence[Run]) -> No
 def _compare(submission: Submission, trained: Trained, table: Table) -> TrainedAgain:
     rows = {(run.arm.setting, run.seed): table.made(run) or [] for run in table.runs}
     rates = _rates(submission, rows)
-    here = made_with([one.versions for own in rows.values() for one in own if one.versions])
+    here = merged(json.loads(one.versions) for own in rows.values() for one in own if one.versions)
     if others := different(trained.made_with, here):
         return TrainedAgain(confirm(rates, "training seeds", AGAIN), others)
     if unlike := next(_unlike(submission, trained, table), None):

@@ -1,7 +1,7 @@
 """The sides of a comparison: training seeds of a policy, where they were evaluated, and the result of each start."""
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
 from itertools import chain
@@ -23,6 +23,7 @@ from lerobot_constructskill.study.rows import (
     STUDY,
     Draws,
     check_folder,
+    merged,
     read_draws,
     read_environments,
     read_rows,
@@ -138,15 +139,6 @@ def check_equal(who: str, one: Mapping[str, Any], other: Mapping[str, Any]) -> N
         raise InputError(f"{who} cannot be compared: they differ in {', '.join(different)}.")
 
 
-def merge_versions(many: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """Merge the versions of several runs: each name with all its different values."""
-    merged: dict[str, dict[str, None]] = {}
-    for versions in many:
-        for name, value in versions.items():
-            merged.setdefault(name, {})[str(value)] = None
-    return {name: ", ".join(values) for name, values in merged.items()}
-
-
 @dataclass(frozen=True)
 class Source:
     """Where a side is read from.
@@ -228,7 +220,7 @@ def read_study(root: Path, arm: str) -> Side:
         kind=f"{plural(rows['training_seed'].nunique(), 'training seed')} of a study",
         env=envs[setting],
         seeds=[_placements_of_rows(own) for _, own in rows.groupby("training_seed", sort=True)],
-        versions=merge_versions(_versions(text, backend) for text, backend in made_with),
+        versions=merged(_versions(text, backend) for text, backend in made_with),
         draws=read_draws(root),
         numbers=sorted(int(number) for number in rows["training_seed"].unique()),
     )
@@ -284,7 +276,7 @@ def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Episod
             raise InputError(
                 f"'{folder}' has two recordings of start {twice[0]}: record each training seed into its own folder."
             )
-    versions = merge_versions(_versions(one.versions, one.backend) for one in recordings)
+    versions = merged(_versions(one.versions, one.backend) for one in recordings)
     if "processor" in versions:
         versions["processor's maker"] = versions.pop("processor")  # in a study's rows, "processor" is its full name
     seeds = [{one.evaluation_seed: one.placed for one in own} for own in by_folder.values()]

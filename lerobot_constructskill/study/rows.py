@@ -4,7 +4,7 @@ A run keeps its episodes as `EpisodeRow`. The table of a study holds `Row`, whic
 has one row for every run that failed or has not been made.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
@@ -102,6 +102,15 @@ class _Settings(TypedDict):
 
 
 SETTINGS = Yaml("a study's file", _Settings)
+
+
+def merged(versions: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """The packages, rooms and processors of several rows by name, each with all its different versions."""
+    found: dict[str, set[str]] = {}
+    for one in versions:
+        for name, version in one.items():
+            found.setdefault(name, set()).add(str(version))
+    return {name: ", ".join(sorted(found[name])) for name in sorted(found)}
 
 
 def read_environments(root: Path) -> dict[str, dict[str, Any]]:

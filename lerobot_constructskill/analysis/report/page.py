@@ -28,6 +28,7 @@ from lerobot_constructskill.study.rows import (
     ROWS,
     STUDY,
     check_folder,
+    merged,
     read_draws,
     read_environments,
     read_rows,
@@ -128,8 +129,7 @@ def provenance(root: Path, rows: pd.DataFrame) -> list[tuple[str, str]]:
         if len(values := sorted(rows[column].dropna().unique())):
             many = f"{len(values)} different, in the column {column} of {ROWS}"
             facts.append((title, ", ".join(values) if len(values) <= SHOWN else many))
-    versions = pd.DataFrame([json.loads(text) for text in rows["versions"].dropna().unique()])
-    facts += [(name, ", ".join(sorted(versions[name].dropna().unique()))) for name in sorted(versions)]
+    facts += merged(map(json.loads, rows["versions"].dropna().unique())).items()
     others = KNOWN.read(root / PROVENANCE) if (root / PROVENANCE).exists() else {}
     return facts + [(name.replace("_", " "), str(value)) for name, value in others.items()]
 
