@@ -129,7 +129,8 @@ def _check_runs(submission: Submission, study: Study, runs: Sequence[Run]) -> No
 def _compare(submission: Submission, trained: Trained, table: Table) -> TrainedAgain:
     rows = {(run.arm.setting, run.seed): table.made(run) or [] for run in table.runs}
     rates = _rates(submission, rows)
-    here = merged(json.loads(one.versions) for own in rows.values() for one in own if one.versions)
+    versions = [one.versions for own in rows.values() for one in own if one.versions]
+    here = merged(map(json.loads, versions))
     if others := different(trained.made_with, here):
         return TrainedAgain(confirm(rates, "training seeds", AGAIN), others)
     if unlike := next(_unlike(submission, trained, table), None):
