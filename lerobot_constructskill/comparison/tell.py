@@ -148,13 +148,12 @@ def _power(judgement: Judgement, alpha: float, unit: str) -> str:
 def _covered(matched: MatchedSides) -> str:
     """What the intervals are over, and that the sides differ in it."""
     a, b = matched.a.covered, matched.b.covered
-    if matched.a.unit != matched.b.unit:
-        a, b = (f"{side.covered}, a unit is a {side.unit}" for side in (matched.a, matched.b))
     if a == b:
         return f"The intervals hold for {a}." if a else ""
     told = {letter: f"{letter}'s interval holds for {one}." for letter, one in (("A", a), ("B", b)) if one}
     missing = [f"What {letter}'s holds for, its files do not say." for letter in "AB" if letter not in told]
-    return " ".join([*told.values(), *missing, "Demonstrations can make the difference as well as policies."])
+    units = [f"A unit is a {matched.a.unit} of A and a {matched.b.unit} of B."] if _unit(matched) == "unit" else []
+    return " ".join([*units, *told.values(), *missing, "Demonstrations can make the difference as well as policies."])
 
 
 def _versions(matched: MatchedSides) -> str:

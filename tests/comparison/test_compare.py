@@ -123,14 +123,17 @@ def test_a_failed_seed_whose_draw_has_starts_of_its_own_placed_nothing(study):
     assert two.rates_a == [0.9, 0.0] and len(two.starts) == 20
 
 
-def test_seeds_of_one_draw_count_as_one(study):
+def test_seeds_of_one_draw_count_as_one(study, recorded):
     draws = {"demonstrations": "own", "seeds_a_draw": 2}
     pairs, other = study([9, 7, 2, 2, 5, 5], draws=draws), study([5] * 6, "other", draws=draws)
     judgement = compared(pairs, other).judgement
     told = tell(compared(pairs, other), 0.05)
     assert "draws that placed" in told and "permutation of draws" in told
     mixed = tell(compared(pairs, study([5] * 6, "of one draw")), 0.05)
-    assert "units that placed" in mixed and "a unit is a draw" in mixed and "a unit is a seed" in mixed
+    assert "units that placed" in mixed and "A unit is a draw of A and a seed of B." in mixed
+    unknown = tell(compared(pairs, recorded([5] * 6)), 0.05)
+    assert "A unit is a draw of A and a seed of B." in unknown and "None" not in unknown
+    assert "What B's holds for, its files do not say." in unknown
     assert "Make more draws of both." in tell(
         compared(study([9, 7], "a", draws=draws), study([1, 2], "b", draws=draws)), 0.05
     )
