@@ -192,8 +192,7 @@ class Maker:
             return []
         with TemporaryDirectory() as scratch:
             copy = Path(scratch) / file.name
-            command = ["git", "-C", str(self.root), "show", f"HEAD:{name}"]
-            copy.write_bytes(subprocess.run(command, check=True, capture_output=True).stdout)
+            copy.write_bytes(self._output("show", f"HEAD:{name}"))
             return load_rows(copy)
 
     def make(self, piece: Piece) -> None:
@@ -211,7 +210,9 @@ class Maker:
 
     def discard(self) -> None:
         """Remove the demonstrations and features that no piece needs any more."""
-        left = [run for _, runs in self.due(self.every) for run in runs]
+        left = [
+            run for piece, runs in self.due(self.every) if runs or not self.is_committed(piece) for run in piece.runs
+        ]
         done = _bulky([run for piece in self.every for run in piece.runs]) - _bulky(left)
         for node in filter(self.store.has, done):
             with self.store.claim([node]):
@@ -255,8 +256,11 @@ class Maker:
             self._git("commit", "--quiet", f"--message={message}", "--", *paths)
 
     def _git(self, *arguments) -> str:
-        command = ["git", "-C", self.root, *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        return self._output(*arguments).decode()
+
+    def _output(self, *arguments) -> bytes:
+        """What git prints."""
+        return subprocess.run(["git", "-C", self.root, *arguments], check=True, capture_output=True).stdout
 
 
 def _bulky(nodes: Sequence[Node]) -> set[Node]:
@@ -296,6 +300,8 @@ def main() -> None:
     if asked.status:
         say(maker.status(pieces))
         return
+    if asked.discard:
+        maker.discard()
     for piece, runs in maker.due(pieces):
         if not runs and maker.is_committed(piece):
             continue
@@ -307,8 +313,6 @@ def main() -> None:
         maker.make(piece)
         if asked.discard:
             maker.discard()
-    if asked.discard:
-        maker.discard()
     say("All is made")
 
 
