@@ -71,11 +71,8 @@ def main(results: str, store: str, variant: str, out: str, seeds: str = "10") ->
     (Path(out) / "table.md").write_text("\n".join(table) + "\n")
     print("\n".join(table))
     if placed and failed:
-        write_video(
-            Path(out) / "failing_and_succeeding.mp4",
-            side_by_side([plain[failed[0]].frames, plain[placed[0]].frames]),
-            FPS,
-        )
+        both = side_by_side([plain[seed].frames for seed in (failed[0], placed[0])])
+        write_video(Path(out) / "failing_and_succeeding.mp4", both, FPS)
 
 
 def play(agents: Mapping[Any, PolicyAgent], env: dict[str, Any]) -> dict[Any, Watched]:
@@ -86,9 +83,8 @@ def play(agents: Mapping[Any, PolicyAgent], env: dict[str, Any]) -> dict[Any, Wa
         watched[number].hand = step.sim["tcp_pose"][:3]
         watched[number].frames.append(step.seen["pixels"]["base"])
 
-    for number, rollout in roll_out(
-        list(agents.values()), env, [[1000]] * len(names), on_step=watch, filmed=range(len(names))
-    ):
+    starts = [[1000]] * len(names)
+    for number, rollout in roll_out(list(agents.values()), env, starts, on_step=watch, filmed=range(len(names))):
         if rollout.error:
             raise rollout.error
         watched[number].stage = rollout.episodes[0].stage

@@ -39,9 +39,8 @@ def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws) -> Findings:
     check_rows(rows)
     rows = rows.assign(draw=rows["training_seed"].map(draws.of))
     planned, runs = rows.drop_duplicates(RUN), runs_of(rows)
-    runs = runs.assign(
-        **{name: runs["training_seed"].map(of) for name, of in (("draw", draws.of), ("unit", draws.unit))}
-    )
+    seeds = runs["training_seed"]
+    runs = runs.assign(draw=seeds.map(draws.of), unit=seeds.map(draws.unit))
     of_variants = planned["role"] == VARIANT
     variants, references = (planned.loc[chosen, "variant"].unique() for chosen in (of_variants, ~of_variants))
     analysis.check(variants, planned["setting"].unique(), references)
