@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.judgement import Judgement, judge
+from lerobot_constructskill.analysis.stats.outcomes import spread_by_chance
 from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
     Side,
@@ -52,6 +53,8 @@ class MatchedSides:
         episodes: how many of them each training seed was evaluated from: all, unless draws have starts of their own.
         n_starts: number of different starts that the sides have together.
         rates_a, rates_b: share of the episodes from `starts` that placed, of each training seed; 0 for a failed one.
+        chance_a, chance_b: standard deviation over seeds that single episodes alone give, as `spread_by_chance` says;
+            None for one seed, or where seeds have different starts or share a draw.
         judgement: the statistics.
     """
 
@@ -63,6 +66,8 @@ class MatchedSides:
     n_starts: int
     rates_a: list[float]
     rates_b: list[float]
+    chance_a: float | None
+    chance_b: float | None
     judgement: Judgement
 
 
@@ -91,9 +96,17 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
         for side in (sides[a], sides[b])
     )
     judgement = judge(sides[a].units(rates_a), sides[b].units(rates_b), alpha)
+    chances = [None if apart else _chance(side, starts) for side in (sides[a], sides[b])]
     return MatchedSides(
-        sides[a], sides[b], conditions(env), starts, episodes, len(either), rates_a, rates_b, judgement
+        sides[a], sides[b], conditions(env), starts, episodes, len(either), rates_a, rates_b, *chances, judgement
     )
+
+
+def _chance(side: Side, starts: Sequence[int]) -> float | None:
+    finished = [placed for placed in side.seeds if placed is not None]
+    if len(finished) < 2 or side.unit != "seed":
+        return None
+    return spread_by_chance(np.array([[placed[start] for start in starts] for placed in finished]))
 
 
 def _rate(placed: Sequence[bool]) -> float:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from glob import glob
 from itertools import chain
 from pathlib import Path
@@ -26,6 +26,7 @@ from lerobot_constructskill.study.rows import (
     merged,
     read_draws,
     read_environments,
+    read_means,
     read_rows,
 )
 
@@ -34,6 +35,9 @@ Placements = Mapping[int, bool]
 
 IN_STUDY, CHECKPOINT, RECORDED = "study", "checkpoint", "recordings"
 """Kinds of sources."""
+
+EVERY = "*"
+"""In place of a setting: every one that is not perturbed."""
 
 CONTENTS = (
     (CHECKPOINT, Path(), "config.json"),
@@ -147,13 +151,15 @@ class Source:
         name: what the user typed.
         kind: `IN_STUDY`, `CHECKPOINT` or `RECORDED`.
         folders: the study's folder, or one folder for each training seed.
-        arm: setting/variant of a study.
+        arm: setting/variant of a study; for several settings */variant or mean/variant, as `settings_of` reads it.
+        recorded: the recordings of each folder, where they were read.
     """
 
     name: str
     kind: str
     folders: tuple[Path, ...]
     arm: str = ""
+    recorded: Mapping[Path, Sequence[Episode]] | None = field(default=None, compare=False)
 
 
 def find(text: str) -> Source:
@@ -226,13 +232,39 @@ def read_study(root: Path, arm: str) -> Side:
     )
 
 
-def settings_of(source: Source) -> list[str]:
-    """The settings of a study in which a source's variant ran, in the study's order. Raises as `read_study` does."""
-    root, variant = source.folders[0], source.arm.rpartition("/")[2]
+def settings_of(source: Source) -> dict[str, str]:
+    """The settings that a study's side names and its variant ran in, to their tasks, in the study's order.
+
+    "*" is every setting that is not perturbed; a name of the study's `analysis.means` is the settings of that mean.
+
+    Raises:
+        MissingError, InputError: as `read_study` does; or "*" would count a task twice.
+    """
+    root, (setting, _, variant) = source.folders[0], source.arm.rpartition("/")
     check_folder(root)
-    rows = read_rows(root / ROWS)
-    ran = rows[(rows["variant"] == variant) & (rows["error_kind"].fillna("") != NOT_RUN)]
-    return [str(name) for name in ran["setting"].unique()]
+    envs, means, rows = read_environments(root), read_means(root), read_rows(root / ROWS)
+    if setting not in (EVERY, *means):
+        return {setting: envs[setting]["task"]} if setting in envs else {}
+    rows = rows[rows["variant"] == variant]
+    if rows.empty:
+        known = ", ".join(read_rows(root / ROWS)["variant"].unique())
+        raise InputError(f"'{root}' has no variant '{variant}'; it has: {known}.")
+    ran = rows.loc[rows["error_kind"].fillna("") != NOT_RUN, "setting"].unique()
+    if setting in means:
+        return {name: envs[name]["task"] for name in means[setting] if name in ran}
+    tasks = {name: env["task"] for name, env in envs.items() if name in ran and not env.get("perturb")}
+    if twice := [name for name, task in tasks.items() if [*tasks.values()].count(task) > 1]:
+        raise InputError(
+            f"'{source.name}' would count {tasks[twice[0]]} more than once ({', '.join(twice)}): name settings under "
+            f"analysis.means in the study's file, and that mean in place of '{EVERY}'."
+        )
+    return tasks
+
+
+def _recordings(folder: Path) -> list[Episode]:
+    whole = folder / RECORDINGS  # a study's run has this file alone, $CONSTRUCTSKILL_RECORD writes many
+    files = [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
+    return list(chain(*map(read_recordings, files)))
 
 
 def _placements_of_rows(rows: pd.DataFrame) -> Placements | None:
@@ -256,12 +288,13 @@ def read(source: Source) -> Side:
     """
     if source.kind == IN_STUDY:
         return read_study(source.folders[0], source.arm)
-    by_folder = {}
-    for folder in source.folders:
-        whole = folder / RECORDINGS  # a study's run has this file alone, $CONSTRUCTSKILL_RECORD writes many
-        files = [whole] if whole.is_file() else sorted(folder.glob("[!.]*.parquet"))
-        by_folder[folder] = list(chain(*map(read_recordings, files)))
+    by_folder = read_recorded(source)
     return recorded_side(source.name, f"recordings of {plural(len(by_folder), 'training seed')}", by_folder)
+
+
+def read_recorded(source: Source) -> Mapping[Path, Sequence[Episode]]:
+    """The recordings in each folder of a source, of any number of tasks. Raises as `read` does."""
+    return source.recorded or {folder: _recordings(folder) for folder in source.folders}
 
 
 def recorded_side(name: str, kind: str, by_folder: Mapping[Path, Sequence[Episode]]) -> Side:

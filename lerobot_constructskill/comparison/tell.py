@@ -12,6 +12,7 @@ from lerobot_constructskill.comparison.match import MatchedSides
 from lerobot_constructskill.comparison.over_tasks import OverTasks
 from lerobot_constructskill.comparison.sides import Side
 from lerobot_constructskill.errors import plural
+from lerobot_constructskill.study.rows import merged
 
 CONCLUSIONS = {
     Conclusion.BETTER: "A is better than B.",
@@ -29,7 +30,7 @@ def tell(matched: MatchedSides | OverTasks, alpha: float) -> str:
     unit = _unit(matched)
     paragraphs = (
         _sides(matched, unit),
-        _conclusion(judgement, alpha, unit),
+        _conclusion(matched, alpha, unit),
         _power(judgement, alpha, unit),
         _covered(matched),
         _versions(matched),
@@ -41,17 +42,24 @@ def _over_tasks(over: OverTasks, alpha: float) -> str:
     """The output for several tasks: each in a line, then the mean over tasks of every seed."""
     one = next(iter(over.tasks.values()))
     unit = _unit(one)
-    head = f"{'':24}{f'A, mean of {unit}s':<18}B, mean of {unit}s"
-    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", "", head]
+    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", f"at most {_steps(over)}, {one.conditions['obs_type']}", ""]
+    lines.append(f"{'':24}{'starts':<24}{f'A, mean of {unit}s':<22}B, mean of {unit}s")
     for name, matched in over.tasks.items():
-        lines.append(f"{name:<24}{matched.judgement.mean_a.value:<18.1%}{matched.judgement.mean_b.value:.1%}")
+        starts = f"{matched.starts[0]} to {matched.starts[-1]} ({len(matched.starts)})"
+        a, b = (f"{mean.value:.1%}" for mean in (matched.judgement.mean_a, matched.judgement.mean_b))
+        lines.append(f"{name:<24}{starts:<24}{a:<22}{b}")
     means = over.judgement.mean_a, over.judgement.mean_b
     shares = [f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})" for mean in means]
-    lines += [f"{'mean over tasks':<24}{shares[0]:<18}  {shares[1]}", ""]
+    lines += [f"{'mean over these':<48}{shares[0]:<22}{shares[1]}", ""]
+    for letter, names in over.left_out.items():
+        lines.append(f"{letter} alone ran in {', '.join(names)}: left out.")
     for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
-        lines.append(f"{letter}, mean over tasks of each seed, %: {' '.join(f'{100 * rate:.0f}' for rate in rates)}")
-    told = _conclusion(over.judgement, alpha, unit), _power(over.judgement, alpha, unit)
-    paragraphs = ("\n".join(lines), *told, _covered(one))
+        seeds = [getattr(matched, letter.lower()).seeds for matched in over.tasks.values()]
+        failed = [" (failed)" if None in of_tasks else "" for of_tasks in zip(*seeds, strict=True)]
+        each = [f"{100 * rate:.0f}{said}" for rate, said in zip(rates, failed, strict=True)]
+        lines.append(f"{letter}, mean over tasks of each seed, %: {' '.join(each)}")
+    told = _conclusion(over, alpha, unit), _power(over.judgement, alpha, unit)
+    paragraphs = ("\n".join(lines), *told, _covered(one), _versions(*over.tasks.values()))
     return "\n\n".join(
         [*filter(None, paragraphs), f"Each {unit} counts once; episodes of different tasks are not pooled."]
     )
@@ -64,6 +72,11 @@ def _unit(matched: MatchedSides) -> str:
 
 def _every(side: Side) -> str:
     return f"{side.name.partition(':')[0]}:*/{side.name.rpartition('/')[2]}: {side.kind}"
+
+
+def _steps(over: OverTasks) -> str:
+    lengths = sorted({matched.conditions["episode_length"] for matched in over.tasks.values()})
+    return " or ".join(plural(length, "step") for length in lengths)
 
 
 def as_json(matched: MatchedSides | OverTasks) -> str:
@@ -103,7 +116,8 @@ def _sides(matched: MatchedSides, unit: str) -> str:
     return "\n".join(lines)
 
 
-def _conclusion(judgement: Judgement, alpha: float, unit: str) -> str:
+def _conclusion(matched: MatchedSides | OverTasks, alpha: float, unit: str) -> str:
+    judgement = matched.judgement
     value, low, high = (100 * share for share in judgement.difference)
     spreads = f"A {100 * judgement.spread_a:.1f}, B {100 * judgement.spread_b:.1f} points"
     interval = f"{100 * (1 - alpha):g} % interval {low:+.0f} to {high:+.0f}"
@@ -113,8 +127,16 @@ def _conclusion(judgement: Judgement, alpha: float, unit: str) -> str:
         f"{unit.capitalize()}s that placed at least once: "
         f"p = {p_value(judgement.counts_p_value)}, Boschloo's exact test.\n"
         f"Spread over {unit}s: standard deviation {spreads}; p = {p_value(judgement.spread_p_value)}.\n"
+        f"{_chance(matched)}"
         f"The interval makes no assumption about how {unit}s vary, so it is wider than the tests suggest."
     )
+
+
+def _chance(matched: MatchedSides | OverTasks) -> str:
+    """How much of the spread is that of single episodes."""
+    each = {"A": matched.chance_a, "B": matched.chance_b}
+    told = ", ".join(f"{letter} {100 * chance:.1f}" for letter, chance in each.items() if chance is not None)
+    return f"Single episodes alone would give {told} points, were all seeds alike.\n" if told else ""
 
 
 def _power(judgement: Judgement, alpha: float, unit: str) -> str:
@@ -137,7 +159,8 @@ def _power(judgement: Judgement, alpha: float, unit: str) -> str:
     found = "no difference, however large" if visible > 1 else f"a difference of {visible * 100:.0f} points"
     told = f"With this many {unit}s, {TARGET:.0%} of comparisons would find {found}, if {unit}s vary as these do."
     ratio = judgement.visible_spread
-    told += f" Of spreads, they would find {'none' if ratio == inf else f'one that is {ratio:g} times the other'}."
+    times = "none" if ratio == inf else f"one that is {ratio:g} times the other"
+    told += f" Of spreads about one mean, they would find {times}."
     needed = judgement.seeds_needed
     if judgement.conclusion is Conclusion.INCONCLUSIVE and needed is not None:
         number = f"more than {MOST}" if needed == inf else f"about {needed}"
@@ -156,10 +179,10 @@ def _covered(matched: MatchedSides) -> str:
     return " ".join([*units, *told.values(), *missing, "Demonstrations can make the difference as well as policies."])
 
 
-def _versions(matched: MatchedSides) -> str:
+def _versions(*each: MatchedSides) -> str:
     """What both sides were made with, and what differs or only one of them says."""
-    names = dict.fromkeys([*matched.a.versions, *matched.b.versions])
-    pairs = {name: tuple(side.versions.get(name, "unknown") for side in (matched.a, matched.b)) for name in names}
+    a, b = merged(matched.a.versions for matched in each), merged(matched.b.versions for matched in each)
+    pairs = {name: (a.get(name, "unknown"), b.get(name, "unknown")) for name in dict.fromkeys([*a, *b])}
     same = "; ".join(f"{name} {a}" for name, (a, b) in pairs.items() if a == b)
     different = "; ".join(f"{name} ({a} and {b})" for name, (a, b) in pairs.items() if a != b)
     told = [f"Both were made with {same}." if same else "", f"They differ in {different}." if different else ""]

@@ -94,8 +94,13 @@ class Draws:
         return "other draws of demonstrations, other starts and other training seeds"
 
 
+class _Means(TypedDict):
+    means: NotRequired[dict[str, list[str]]]
+
+
 class _Settings(TypedDict):
     settings: dict[str, _Environment]
+    analysis: NotRequired[_Means | None]
     demonstrations: NotRequired[Literal["shared", "own"]]
     starts: NotRequired[Literal["shared", "own"]]
     seeds_a_draw: NotRequired[Annotated[int, Ge(1)]]
@@ -120,6 +125,11 @@ def read_environments(root: Path) -> dict[str, dict[str, Any]]:
         InputError: its file is not a study's.
     """
     return {name: of["env"] for name, of in SETTINGS.read(root / STUDY)["settings"].items()}
+
+
+def read_means(root: Path) -> dict[str, list[str]]:
+    """Read what a study's folder takes means over: name to settings, `analysis.means`. Raises as `read_draws` does."""
+    return (SETTINGS.read(root / STUDY).get("analysis") or {}).get("means", {})
 
 
 def read_draws(root: Path) -> Draws:

@@ -63,6 +63,40 @@ def by_unit(rates: Sequence[float] | np.ndarray, units: Sequence[int]) -> np.nda
     return pd.Series(rates, dtype=float).groupby(list(units), sort=False).mean().to_numpy()
 
 
+def spread_by_chance(met: np.ndarray) -> float:
+    """Standard deviation over seeds (divisor n) of the share of episodes that is expected where seeds do not differ.
+
+    Each start is then met by every seed with one probability of its own, which the seeds that met it estimate. A
+    spread about as large tells nothing of the seeds: more starts make this one smaller.
+
+    Args:
+        met: whether each seed met the criterion from each start, bool (seeds, starts).
+    """
+    rates = met.mean(axis=0)
+    return float(np.sqrt((rates * (1 - rates)).sum()) / len(rates))
+
+
+def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
+    """`spread_by_chance` of a variant's episodes, or of its mean over settings.
+
+    Args:
+        episodes: rows of one variant.
+        criterion: one of `CRITERIA`.
+
+    Returns:
+        None if fewer than two seeds finished, or they have different starts.
+    """
+    each = []
+    for _, own in episodes[episodes["error_kind"].isna()].groupby("setting"):
+        if own.duplicated(["training_seed", "evaluation_seed"]).any():
+            return None
+        met = own.pivot(index="training_seed", columns="evaluation_seed", values=criterion)
+        if len(met) < 2 or met.isna().any(axis=None):
+            return None
+        each.append(spread_by_chance(met.to_numpy(bool)))
+    return float(np.hypot.reduce(each)) / len(each) if each else None
+
+
 def count(rates: np.ndarray) -> Counts:
     """Count the seeds that met a criterion in at least one episode (paper, Table I).
 
