@@ -22,12 +22,15 @@ class Success(NamedTuple):
         exact: share of those seeds with Clopper-Pearson's interval.
         mean: share of episodes, averaged over seeds, with Gaffke's interval.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
+        chance: of that, what single episodes give if seeds do not differ, as `spread_by_chance` says; None where draws
+            stand for seeds, or seeds have different starts.
     """
 
     counts: Counts
     exact: Estimate
     mean: Estimate
     spread: float
+    chance: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,11 @@ class SettingFindings:
     def validated(self) -> list[VariantFindings]:
         """Variants with a known held-out error."""
         return [one for one in self.variants if one.error is not None]
+
+    @property
+    def spread(self) -> list[VariantFindings]:
+        """Variants with several seeds, or draws, that have results."""
+        return [one for one in self.variants if one.success and one.success["placed"].counts.seeds > 1]
 
     @property
     def drawn(self) -> list[VariantFindings]:

@@ -40,6 +40,11 @@ def deviation(estimate: Estimate) -> str:
     return f"{value} ({low}–{high})" if estimate.high <= 0.5 else f"{value} (not determined)"
 
 
+def in_points(share: float | None) -> str:
+    """A share in points: 0.061 -> "6.1"; "–" for None."""
+    return "–" if share is None else f"{100 * share:.1f}"
+
+
 def p_value(p: float) -> str:
     """A p-value as journals print it: "0.0031", "0.042", "0.65", "< 0.0001"."""
     if p < 1e-4:

@@ -19,7 +19,7 @@ from lerobot_constructskill.analysis.stats.comparisons import compare
 from lerobot_constructskill.analysis.stats.components import Components, split
 from lerobot_constructskill.analysis.stats.correlation import Correlation, kendall
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_unit, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, RUN, by_unit, chance_of, count, runs_of
 from lerobot_constructskill.analysis.stats.walls import wall_of
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, VARIANT, Draws
@@ -50,7 +50,7 @@ def summarize(analysis: Analysis, rows: pd.DataFrame, draws: Draws) -> Findings:
     }
     return Findings(
         settings=list(settings.values()),
-        means=[_mean(analysis, name, own, planned, runs) for name, own in analysis.means.items()],
+        means=[_mean(analysis, name, own, planned, runs, rows) for name, own in analysis.means.items()],
         sweeps=[
             Sweep(analysis.label(name), [settings[one] for one in swept]) for name, swept in analysis.sweeps.items()
         ],
@@ -89,7 +89,7 @@ def check_rows(rows: pd.DataFrame) -> None:
 
 
 def _mean(
-    analysis: Analysis, name: str, settings: list[str], planned: pd.DataFrame, runs: pd.DataFrame
+    analysis: Analysis, name: str, settings: list[str], planned: pd.DataFrame, runs: pd.DataFrame, rows: pd.DataFrame
 ) -> SettingFindings:
     """The mean over some settings: each seed's share is the mean of its shares, whatever number of episodes they have.
 
@@ -101,11 +101,11 @@ def _mean(
     means = means.merge(own[[*shares, "heldout_mse_m2"]].mean()).assign(setting=name, heldout_mse_m2_by_data=None)
     whole = means[(own.size()["size"] == len(settings)).to_numpy()]
     seeds = planned[planned["setting"].isin(settings)].drop_duplicates(["variant", "training_seed"])
-    return _setting(analysis, name, seeds.assign(setting=name), whole, None)
+    return _setting(analysis, name, seeds.assign(setting=name), whole, rows[rows["setting"].isin(settings)])
 
 
 def _setting(
-    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None
+    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
 ) -> SettingFindings:
     """One setting. Only the tables follow `analysis.order`, so that another order shows the same numbers."""
     of_variants = planned["role"] == VARIANT
@@ -136,13 +136,10 @@ def _setting(
 
 
 def _variants(
-    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None
+    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
 ) -> list[VariantFindings]:
-    def of(table: pd.DataFrame | None, name: str) -> pd.DataFrame | None:
-        return None if table is None else table[table["variant"] == name]
-
     return [
-        _variant(analysis.label(name), own, of(runs, name), of(episodes, name))
+        _variant(analysis.label(name), own, *(table[table["variant"] == name] for table in (runs, episodes)))
         for name, own in planned.groupby("variant", sort=False)
     ]
 
@@ -151,6 +148,7 @@ def _variant(
     label: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None = None
 ) -> VariantFindings:
     finished = runs["error_kind"].isna().any()
+    of_task = episodes if episodes is not None and episodes["setting"].nunique() == 1 else None
     by_data = pd.DataFrame([json.loads(errors) for errors in runs["heldout_mse_m2_by_data"].dropna()])
     return VariantFindings(
         name=planned["variant"].iloc[0],
@@ -158,11 +156,11 @@ def _variant(
         demonstrations=next(iter(planned["demonstrations"].dropna()), None),
         training_seeds=tuple(sorted(planned["training_seed"])),
         runs=runs,
-        success={criterion: _success(runs, criterion) for criterion in CRITERIA} if finished else {},
+        success={criterion: _success(runs, episodes, criterion) for criterion in CRITERIA} if finished else {},
         error=_mean_and_range(runs["heldout_mse_m2"]),
         errors_by_data={data: _mean_and_range(by_data[data]) for data in by_data},
-        components=None if episodes is None else _components(episodes),
-        wall=None if episodes is None else wall_of(episodes),
+        components=None if of_task is None else _components(of_task),
+        wall=None if of_task is None else wall_of(of_task),
     )
 
 
@@ -175,10 +173,12 @@ def _mean_and_range(errors: pd.Series) -> Estimate | None:
     return Estimate(float(known.mean()), float(known.min()), float(known.max())) if len(known) else None
 
 
-def _success(runs: pd.DataFrame, criterion: str) -> Success:
+def _success(runs: pd.DataFrame, episodes: pd.DataFrame | None, criterion: str) -> Success:
     rates = _rates(runs, criterion)
     counts = count(rates)
-    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()))
+    has_chance = episodes is not None and not runs["unit"].duplicated().any()
+    chance = chance_of(episodes, criterion) if has_chance else None
+    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()), chance)
 
 
 def _rates(runs: pd.DataFrame, criterion: str) -> np.ndarray:

@@ -10,7 +10,7 @@ from scipy.stats import PermutationMethod, beta, boschloo_exact, chi2_contingenc
 from scipy.stats.contingency import crosstab
 from statsmodels.stats.multitest import multipletests
 
-from lerobot_constructskill.analysis.stats.intervals import Estimate, newcombe
+from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate, newcombe
 from lerobot_constructskill.analysis.stats.outcomes import Counts, count
 
 ALIKE_WITHIN = 0.2
@@ -39,9 +39,9 @@ class Comparison(NamedTuple):
         fisher, boschloo: two-tailed p-values of the counts.
         holm: Boschloo's p-value, corrected over the declared comparisons.
         probability_better: probability that a's rate is higher.
-        conclusion: from `holm` and `difference`.
-        mean: mean over seeds of a's share of episodes minus that of b's.
+        mean: mean over seeds of a's share of episodes minus that of b's, with its interval at 1 - alpha.
         mean_holm: p-value of `mean` from a permutation of seeds, corrected over the declared comparisons.
+        conclusion: from `mean_holm` and `mean`. Counts decide nothing: where all seeds succeed once, they are equal.
         spread: standard deviation over seeds of a's share minus that of b's.
         spread_holm: p-value of `spread`, likewise.
     """
@@ -55,9 +55,9 @@ class Comparison(NamedTuple):
     boschloo: float
     holm: float
     probability_better: float
-    conclusion: Conclusion
-    mean: float
+    mean: Estimate
     mean_holm: float
+    conclusion: Conclusion
     spread: float
     spread_holm: float
 
@@ -123,25 +123,32 @@ def compare(
     corrected = [holm(found, len(pairs)) for found in (p_values, mean_p_values, spread_p_values)]
     compared = []
     for (a, b), p_value, of_counts, of_means, of_spreads in zip(made, p_values, *corrected, strict=True):
-        difference = newcombe(counts[a], counts[b], level=1 - alpha)
+        mean = mean_difference(*(mean_rate(rates[name], 1 - alpha) for name in (a, b)))
         comparison = Comparison(
             a=a,
             b=b,
             counts_a=counts[a],
             counts_b=counts[b],
-            difference=difference,
+            difference=newcombe(counts[a], counts[b], level=1 - alpha),
             fisher=fisher(counts[a], counts[b]),
             boschloo=p_value,
             holm=of_counts,
             probability_better=probability_better(counts[a], counts[b]),
-            conclusion=conclude(of_counts, difference, alpha),
-            mean=rates[a].mean() - rates[b].mean(),
+            mean=mean,
             mean_holm=of_means,
+            conclusion=conclude(of_means, mean, alpha),
             spread=rates[a].std() - rates[b].std(),
             spread_holm=of_spreads,
         )
         compared.append(comparison)
     return compared
+
+
+def mean_difference(a: Estimate, b: Estimate) -> Estimate:
+    """Difference of two means from their intervals, by Newcombe's (1998) formula for rates."""
+    value = a.value - b.value
+    below, above = np.hypot(a.value - a.low, b.high - b.value), np.hypot(a.high - a.value, b.value - b.low)
+    return Estimate(value, max(-1.0, float(value - below)), min(1.0, float(value + above)))
 
 
 def mean_p_value(a: np.ndarray, b: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from lerobot_constructskill.analysis.stats.comparisons import (
     Conclusion,
     boschloo,
     conclude,
+    mean_difference,
     mean_p_value,
     spread_p_value,
 )
@@ -96,13 +97,6 @@ def smallest_p_value(seeds_a: int, seeds_b: int) -> float:
         return 1.0
     exact = (1 + (seeds_a == seeds_b)) / comb(seeds_a + seeds_b, seeds_a)
     return max(exact, 1 / (PERMUTATIONS + 1))  # of random permutations, if there are too many to try all
-
-
-def mean_difference(a: Estimate, b: Estimate) -> Estimate:
-    """Difference of two means from their intervals, by Newcombe's (1998) formula for rates."""
-    value = a.value - b.value
-    below, above = np.hypot(a.value - a.low, b.high - b.value), np.hypot(a.high - a.value, b.value - b.low)
-    return Estimate(value, max(-1.0, float(value - below)), min(1.0, float(value + above)))
 
 
 def _deviation(a: np.ndarray, b: np.ndarray) -> float:
