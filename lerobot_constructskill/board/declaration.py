@@ -30,6 +30,10 @@ DRAWS = {"shared": "one draw of demonstrations", "own": "draws of demonstrations
 """What training seeds learnt from, as the board says it. An interval over seeds of one draw covers no other draw."""
 
 
+POLICIES = {"one": "one policy for all settings", "several": "several policies for its settings"}
+"""What a training seed of an entry is, as the board says it."""
+
+
 @dataclass(frozen=True)
 class About(Checked):
     """Description of a submission's policy.
@@ -45,6 +49,7 @@ class About(Checked):
         observes: one of `OBSERVES`.
         demonstrations: whether all training seeds learnt from one draw of demonstrations, or each from its own; one of
             `DRAWS`, and None where it is not said.
+        policies: whether a training seed is one policy for all settings; one of `POLICIES`, None where it is not said.
         url: where its checkpoints are.
         notes: anything else that a reader must know.
 
@@ -61,6 +66,7 @@ class About(Checked):
     compute: Line
     observes: Annotated[str, Among(OBSERVES)]
     demonstrations: Annotated[str, Among(tuple(DRAWS))] | None = None
+    policies: Annotated[str, Among(tuple(POLICIES))] | None = None
     url: Link | None = None
     notes: Line | None = None
 
@@ -89,6 +95,14 @@ class Trained(Checked):
     recipe_sha256: Hash
     weights: dict[str, list[Hash | None]]
     made_with: dict[Line, Line]
+
+    @property
+    def policies(self) -> str | None:
+        """As in `About`, by the weights; None with a single setting."""
+        if len(self.weights) == 1:
+            return None
+        first, *others = self.weights.values()
+        return "one" if others == [first] * len(others) and any(first) else "several"
 
 
 @dataclass(frozen=True)
@@ -131,6 +145,10 @@ class Declaration:
         weights = self.trained.weights if self.trained else dict.fromkeys(self.settings, self.training_seeds)
         if {name: len(own) for name, own in weights.items()} != dict.fromkeys(self.settings, len(self.training_seeds)):
             raise InputError("trained.weights must name the weights of each training seed in each setting.")
+        if self.trained and self.about.policies not in (None, self.trained.policies):
+            raise InputError(
+                f"about.policies is {self.about.policies}, but by their weights it is {self.trained.policies}."
+            )
         if self.about.is_policy and self.backend.endswith(UNSEEING):
             raise InputError(
                 f"about.observes is {self.about.observes}, but the backend '{self.backend}' shows no pictures: "
@@ -160,6 +178,14 @@ class Declaration:
                 f"The setting {name} must have its control beside it: a setting of the same task, length and starts "
                 "without a perturbation."
             )
+
+    @property
+    def policies(self) -> str:
+        """Whether a training seed is one policy, in words; empty for one setting or what is no policy."""
+        if len(self.settings) == 1 or not self.about.is_policy:
+            return ""
+        known = self.trained.policies if self.trained else self.about.policies
+        return POLICIES.get(known or "", "one policy or several, not said")
 
     @property
     def settings_class(self) -> str:

@@ -181,7 +181,7 @@ def submit(
             for start in setting.starts:
                 found = [one for one in there if one.evaluation_seed == start]
                 missing = Claim(start, setting=name, training_seed=seed, error=failures.get(seed))
-                claims.append(_claim(found, missing, setting))
+                claims.append(_claim(found, missing, setting, [one.evaluation_seed for one in there]))
     ended = [claim for claim in claims if claim.error is None]
     if not ended:
         raise InputError("Nothing was recorded.")
@@ -205,16 +205,22 @@ def submit(
     )
 
 
-def _claim(found: Sequence[Episode], missing: Claim, setting: BoardSetting) -> Claim:
-    """The claim of an episode that was recorded, or `missing`, which says why it was not."""
+def _claim(found: Sequence[Episode], missing: Claim, setting: BoardSetting, there: Sequence[int]) -> Claim:
+    """The claim of an episode that was recorded, or `missing`, which says why it was not; `there` are other starts."""
     if len({one.flat.tobytes() for one in found}) > 1:
         raise InputError(f"{missing.label} was recorded twice, with different actions; record into an empty folder.")
     if found:
         return Claim(**vars(found[0]), setting=missing.setting, training_seed=missing.training_seed)
     if missing.error is None:
+        of = f"(task {setting.task}, {setting.episode_length} steps)"
+        if there and not {*there} & {*setting.starts}:
+            raise InputError(
+                f"{missing.label} was not recorded {of}: starts {min(there)} to {max(there)} were, and "
+                f"{setting.starts[0]} to {setting.starts[-1]} are asked for; for other starts give --settings."
+            )
         raise InputError(
-            f"{missing.label} was not recorded (task {setting.task}, {setting.episode_length} steps); evaluate it, or "
-            f"say in --failures why training seed {missing.training_seed} failed."
+            f"{missing.label} was not recorded {of}; evaluate it, or say in --failures why training seed "
+            f"{missing.training_seed} failed."
         )
     return missing
 

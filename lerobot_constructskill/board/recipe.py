@@ -27,6 +27,8 @@ RECIPE = Yaml("a recipe, the fields of a study", dict[str, Any])
 A_PATH = re.compile(r"[/~.\\]|.*(\.\.|\\)|.*\.(ya?ml|json|safetensors|ckpt|bin|pth?|py|parquet)$")
 """Text that names a file, from its beginning on."""
 
+ON_THE_HUB, COMMIT = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*"), re.compile("[0-9a-f]{40}")
+
 
 def recipe_of(root: Path, variant: str, settings: Mapping[str, str]) -> str:
     """The recipe of a study's variant.
@@ -74,7 +76,8 @@ def check_plain(values: Mapping[str, Any]) -> None:
             raise InputError(f"A recipe names no file, and {where} is {path!a:.80}.")
         name, field = (_split(text) or [""])[0], where.rpartition(".")[2]
         if field.endswith("path"):
-            raise InputError(f"A recipe names no file, and {where} is {text!a:.80}.")
+            also = " without pretrained_revision, a commit on the Hub" * (field == "pretrained_path")
+            raise InputError(f"A recipe names no file, and {where} is {text!a:.80}{also}.")
         kind = {"data": "generate", "dagger": "dagger"}.get(field)
         if kind and not name.startswith("--") and name not in names(kind):
             raise InputError(f"A recipe names shipped configurations, and {where} is {name!a:.80}.")
@@ -83,15 +86,23 @@ def check_plain(values: Mapping[str, Any]) -> None:
 
 
 def _texts(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
-    """Every text in plain values, and where it stands."""
+    """Every text in plain values but the weights that `_is_pinned` allows, and where it stands."""
     if isinstance(value, Mapping):
         for name, one in value.items():
+            if name == "pretrained_path" and _is_pinned(value):
+                continue
             yield from _texts(one, f"{where}.{name}".lstrip("."))
     elif isinstance(value, list):
         for one in value:
             yield from _texts(one, where)
     elif isinstance(value, str):
         yield where, value
+
+
+def _is_pinned(policy: Mapping[str, Any]) -> bool:
+    """Whether a policy starts from the weights of one commit of a repository on the Hub."""
+    name, commit = str(policy["pretrained_path"]), str(policy.get("pretrained_revision"))
+    return bool(ON_THE_HUB.fullmatch(name) and COMMIT.fullmatch(commit) and not A_PATH.match(name))
 
 
 def _split(text: str) -> list[str]:

@@ -37,7 +37,8 @@ def instructions(submission: Submission, value: PublicValue) -> str:
     plain = {name: asdict(setting) for name, setting in settings.items()}
     return "\n".join(
         [
-            f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N:",
+            f"The fresh starts are {first} and those that follow. For the checkpoint of each training seed N (with "
+            "the --rename_map of its training, if any):",
             *commands,
             "Then make a submission of it with these settings, and verify it with --value and --rerun:",
             yaml.safe_dump(plain, default_flow_style=None, sort_keys=False, width=300).strip(),

@@ -10,6 +10,7 @@ import yaml
 from commands import call
 from forge import declare, edit
 
+from lerobot_constructskill.board.declaration import Trained
 from lerobot_constructskill.board.recipe import check_plain
 from lerobot_constructskill.board.retrain import study_of
 from lerobot_constructskill.board.submission import RECIPE_FILE, read_submission, write_submission
@@ -33,7 +34,7 @@ RECIPE = {
         ("task", "plan:~/wall.yaml", "names no file"),
         ("task", "plan:wall", "names shipped plans"),
         ("backbone_path", "weights", "names no file"),
-        ("pretrained_path", "ada/policy", "names no file"),
+        ("pretrained_path", "ada/policy", "names no file, .*'ada/policy' without pretrained_revision, a commit"),
         ("backbone", "model.safetensors", "names no file"),
         ("dagger", "./rounds", "names no file"),
     ],
@@ -46,6 +47,28 @@ def test_a_recipe_is_plain_data(where, value, said):
     of.get(where, recipe["variants"]["ours"]["policy"])[where] = value
     with pytest.raises(InputError, match=said):
         check_plain(recipe)
+
+
+def test_weights_of_one_commit_on_the_hub_are_plain_data():
+    recipe = json.loads(json.dumps(RECIPE))
+    policy = recipe["variants"]["ours"]["policy"]
+    policy |= {"pretrained_path": "lerobot/smolvla_base", "pretrained_revision": "0a" * 20}
+    check_plain(recipe)
+    for changed in (
+        {"pretrained_path": "../smolvla_base"},
+        {"pretrained_path": "a/b/c"},
+        {"pretrained_revision": "main"},
+    ):
+        policy |= {"pretrained_path": "lerobot/smolvla_base", "pretrained_revision": "0a" * 20} | changed
+        with pytest.raises(InputError, match="names no file"):
+            check_plain(recipe)
+
+
+def test_whether_an_entry_is_one_policy_is_told_by_its_weights():
+    weights = {"a": ["0" * 64, "1" * 64], "b": ["0" * 64, "1" * 64]}
+    assert Trained("2" * 64, weights, {}).policies == "one"
+    assert Trained("2" * 64, weights | {"b": ["1" * 64, "0" * 64]}, {}).policies == "several"
+    assert Trained("2" * 64, {"a": weights["a"]}, {}).policies is None
 
 
 ABOUT = dict.fromkeys(("name", "submitter", "policy", "revision", "data", "training", "compute"), "a test's")
