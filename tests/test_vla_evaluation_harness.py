@@ -128,6 +128,17 @@ def test_an_episode_is_its_seed(benchmark_class):
     assert (images[0] == images[2]).all() and (images[0] != images[1]).any()
 
 
+@pytest.mark.sim
+@pytest.mark.parametrize("perturb", ["language=3", "wrong_task=1"])
+def test_the_model_is_told_the_sentence_of_the_perturbation(perturb, benchmark_class):
+    benchmark = benchmark_class(tasks="brick_to_grey", perturb=perturb, perturb_seed=1)
+    (task,) = benchmark.get_tasks()
+    asyncio.run(benchmark.start_episode(task))
+    told = asyncio.run(benchmark.get_observation())["task_description"]
+    assert told == benchmark._env.task_description != get_task("brick_to_grey").instruction
+    benchmark.cleanup()
+
+
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["subname"])
 def test_every_entry_of_the_yaml_makes_a_benchmark(entry, benchmark_class):
     read = EvalConfig.from_dict(entry)

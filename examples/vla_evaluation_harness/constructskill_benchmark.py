@@ -19,7 +19,7 @@ from lerobot_constructskill.contract import (
     select_tasks,
 )
 from lerobot_constructskill.envs.actions import MANISKILL_CHANNELS
-from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
+from lerobot_constructskill.envs.gym_env import ConstructSkillEnv, perturbed_task
 
 OBS_TYPE = "pixels_agent_pos"
 
@@ -36,7 +36,9 @@ class ConstructSkillBenchmark(StepBenchmark):
         tasks: what `--env.task` takes: tasks or suites with commas between.
         seed: seed of the first episode of every task.
         max_steps: horizon of every task; each task's own by default.
-        perturb: `axis=level` with commas between, as `--env.perturb` takes it.
+        perturb: `axis=level` with commas between, as `--env.perturb` takes it; of `language` and `wrong_task` the
+            model is told what they say.
+        perturb_seed: as `--env.perturb_seed`.
         light_robot: as `--env.light_robot`: which robot is drawn; a model's training data say which it has seen.
     """
 
@@ -49,11 +51,17 @@ class ConstructSkillBenchmark(StepBenchmark):
         seed: int = 1000,
         max_steps: int | None = None,
         perturb: str = "",
+        perturb_seed: int = 0,
         light_robot: bool | None = None,
     ):
         super().__init__()
-        self._rows = [(suite, row) for suite, rows in select_tasks(tasks).items() for row in rows]
-        self._seed, self._max_steps, self._perturb = seed, max_steps, perturb
+        self._perturb, self._perturb_seed = perturb, perturb_seed
+        self._rows = []
+        for suite, rows in select_tasks(tasks).items():
+            for name in (row.name for row in rows):
+                row, perturbation = perturbed_task(name, perturb, perturb_seed)
+                self._rows.append((suite, perturbation.told(row)))
+        self._seed, self._max_steps = seed, max_steps
         self._light_robot = light_robot
         self._env: ConstructSkillEnv | None = None
 
@@ -83,6 +91,7 @@ class ConstructSkillBenchmark(StepBenchmark):
                 self._light_robot,
                 render_backend=self._render_backend,
                 perturb=self._perturb,
+                perturb_seed=self._perturb_seed,
             )
         observation, _ = self._env.reset(seed=self._seed + task.get("episode_idx", 0))
         self._recorder.record_video(observation["pixels"]["base"])

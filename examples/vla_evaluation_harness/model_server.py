@@ -6,7 +6,7 @@
 The server is the harness's own; this lets LeRobot find its plugins first, gives a policy the cameras that it was
 trained on, and says what the checkpoint sends and reads: the harness compares that with the benchmark's specification
 before the first episode and warns of every field that differs. `use_select_action` asks the policy at every step,
-which temporal ensembling needs; without it a chunk is executed whole.
+which temporal ensembling needs; without it the harness executes the checkpoint's `n_action_steps` of each chunk.
 """
 
 from dataclasses import replace
