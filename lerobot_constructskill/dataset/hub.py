@@ -61,10 +61,6 @@ def locate(repo_id: str | None, root: Path | None = None, revision: str | None =
         FileNotFoundError: the folder is not there.
         OSError: there is no such data set or revision, the Hub cannot be reached, or it refuses the token.
     """
-    from lerobot.datasets import CODEBASE_VERSION
-
-    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
-
     if root is not None:
         if not root.is_dir():
             raise MissingError(f"There is no folder {root}.")
@@ -73,6 +69,10 @@ def locate(repo_id: str | None, root: Path | None = None, revision: str | None =
         return root
     if repo_id is None:
         raise InputError("Give a data set's name with --repo_id, or its folder with --root.")
+    from lerobot.datasets import CODEBASE_VERSION  # ten seconds, which a mistake need not wait
+
+    from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE
+
     if revision is None and (HF_LEROBOT_HOME / repo_id / "meta").is_dir():
         return HF_LEROBOT_HOME / repo_id
     revision = revision or CODEBASE_VERSION
