@@ -58,9 +58,9 @@ class ConstructSkillBenchmark(StepBenchmark):
         self._perturb, self._perturb_seed = perturb, perturb_seed
         self._rows = []
         for suite, rows in select_tasks(tasks).items():
-            for name in (row.name for row in rows):
-                row, perturbation = perturbed_task(name, perturb, perturb_seed)
-                self._rows.append((suite, perturbation.told(row)))
+            for row in rows:
+                task, perturbation = perturbed_task(row.name, perturb, perturb_seed)
+                self._rows.append((suite, perturbation.told(task)))
         self._seed, self._max_steps = seed, max_steps
         self._light_robot = light_robot
         self._env: ConstructSkillEnv | None = None

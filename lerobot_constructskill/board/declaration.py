@@ -98,11 +98,11 @@ class Trained(Checked):
 
     @property
     def policies(self) -> str | None:
-        """As in `About`, by the weights; None with a single setting."""
-        if len(self.weights) == 1:
+        """As in `About`, by the seeds that have weights in all settings; None with one setting or no such seed."""
+        whole = [seed for seed in zip(*self.weights.values(), strict=True) if all(seed)]
+        if len(self.weights) == 1 or not whole:
             return None
-        first, *others = self.weights.values()
-        return "one" if others == [first] * len(others) and any(first) else "several"
+        return "one" if all(len(set(seed)) == 1 for seed in whole) else "several"
 
 
 @dataclass(frozen=True)
@@ -145,10 +145,9 @@ class Declaration:
         weights = self.trained.weights if self.trained else dict.fromkeys(self.settings, self.training_seeds)
         if {name: len(own) for name, own in weights.items()} != dict.fromkeys(self.settings, len(self.training_seeds)):
             raise InputError("trained.weights must name the weights of each training seed in each setting.")
-        if self.trained and self.about.policies not in (None, self.trained.policies):
-            raise InputError(
-                f"about.policies is {self.about.policies}, but by their weights it is {self.trained.policies}."
-            )
+        known = self.trained and self.trained.policies
+        if known and self.about.policies not in (None, known):
+            raise InputError(f"about.policies is {self.about.policies}, but by its weights an entry of {known}.")
         if self.about.is_policy and self.backend.endswith(UNSEEING):
             raise InputError(
                 f"about.observes is {self.about.observes}, but the backend '{self.backend}' shows no pictures: "
@@ -184,7 +183,7 @@ class Declaration:
         """Whether a training seed is one policy, in words; empty for one setting or what is no policy."""
         if len(self.settings) == 1 or not self.about.is_policy:
             return ""
-        known = self.trained.policies if self.trained else self.about.policies
+        known = (self.trained and self.trained.policies) or self.about.policies
         return POLICIES.get(known or "", "one policy or several, not said")
 
     @property

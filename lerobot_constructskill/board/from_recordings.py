@@ -206,7 +206,7 @@ def submit(
 
 
 def _claim(found: Sequence[Episode], missing: Claim, setting: BoardSetting, there: Sequence[int]) -> Claim:
-    """The claim of an episode that was recorded, or `missing`, which says why it was not; `there` are other starts."""
+    """The claim of a recorded episode, or `missing`, which says why it was not; `there` are its seed's starts."""
     if len({one.flat.tobytes() for one in found}) > 1:
         raise InputError(f"{missing.label} was recorded twice, with different actions; record into an empty folder.")
     if found:

@@ -102,7 +102,8 @@ def _texts(value: Any, where: str = "") -> Iterator[tuple[str, str]]:
 def _is_pinned(policy: Mapping[str, Any]) -> bool:
     """Whether a policy starts from the weights of one commit of a repository on the Hub."""
     name, commit = str(policy["pretrained_path"]), str(policy.get("pretrained_revision"))
-    return bool(ON_THE_HUB.fullmatch(name) and COMMIT.fullmatch(commit) and not A_PATH.match(name))
+    is_local = A_PATH.match(name) or Path(name).exists()  # which LeRobot prefers to the Hub
+    return bool(ON_THE_HUB.fullmatch(name) and COMMIT.fullmatch(commit)) and not is_local
 
 
 def _split(text: str) -> list[str]:

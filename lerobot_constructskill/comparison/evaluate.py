@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_constructskill.comparison.sides import Side, Source, conditions, recorded_side
+from lerobot_constructskill.contract import label_of
 from lerobot_constructskill.envs.recording import write_recordings
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
@@ -53,7 +54,7 @@ def evaluate(
                 raise InputError(f"The checkpoint '{checkpoint}' failed in its evaluation ({said}).") from error
             recordings = by_folder[checkpoint] = rollouts[number].recordings(facts)
             if kept_in is not None:
-                file = f"{facts['task']}{facts['perturbation']}.parquet"
+                file = f"{label_of(facts['task'])}_{facts['episode_length']}{facts['perturbation']}.parquet"
                 write_recordings(recordings, kept_in / f"{len(by_folder) - 1:02d}_{_label(checkpoint)}" / file)
     return recorded_side(source.name, f"{plural(len(by_folder), 'checkpoint')}, evaluated now", by_folder)
 

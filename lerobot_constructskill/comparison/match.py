@@ -53,8 +53,7 @@ class MatchedSides:
         episodes: how many of them each training seed was evaluated from: all, unless draws have starts of their own.
         n_starts: number of different starts that the sides have together.
         rates_a, rates_b: share of the episodes from `starts` that placed, of each training seed; 0 for a failed one.
-        chance_a, chance_b: standard deviation over seeds that single episodes alone give, as `spread_by_chance` says;
-            None for one seed, or where seeds have different starts or share a draw.
+        chance_a, chance_b: standard deviation over seeds that single episodes alone give, as `chance` says.
         judgement: the statistics.
     """
 
@@ -71,6 +70,26 @@ class MatchedSides:
     judgement: Judgement
 
 
+@dataclass(frozen=True)
+class Prepared:
+    """Two sides of which everything is checked that can be before anything is evaluated.
+
+    Args:
+        sources: of a and of b.
+        a, b: the sides; None for checkpoints, which are to be evaluated.
+        env: keyword arguments of the `ConstructSkillEnv` that both act in.
+        starts: as in `MatchedSides`.
+        apart: starts of each training seed, where draws have starts of their own.
+    """
+
+    sources: tuple[Source, Source]
+    a: Side | None
+    b: Side | None
+    env: Mapping[str, Any]
+    starts: list[int]
+    apart: list[set[int]] | None
+
+
 def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) -> MatchedSides:
     """Read or evaluate two sides and judge a against b.
 
@@ -78,35 +97,68 @@ def match(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) 
         MissingError: a side is not there.
         InputError: a side cannot be read, or nothing of it can be compared with the other.
     """
+    return finish(prepare(a, b, asked), evaluate, alpha)
+
+
+def prepare(a: Source, b: Source, asked: Asked) -> Prepared:
+    """Read two sides and check that they can be compared. Raises as `match` does."""
     _check_sources(a, b, asked)
-    sides = {one: read(one) for one in (a, b) if one.kind != CHECKPOINT}
-    env = _common_env(sides.values(), asked)
-    if apart := _starts_apart(list(sides.values())):
-        if asked.episodes:
-            raise InputError("Draws of these sides have starts of their own: leave out --episodes.")
-        starts, episodes, either = sorted(set.union(*apart)), max(map(len, apart)), set.union(*apart)
-    else:
-        starts = _common_starts(sides.values(), asked)
-        for one in (a, b):
-            if one.kind == CHECKPOINT:
-                sides[one] = evaluate(one, env, starts)
-        episodes, either = len(starts), set.union(*(side.starts or set() for side in sides.values()))
+    of_a, of_b = (None if one.kind == CHECKPOINT else read(one) for one in (a, b))
+    known = [side for side in (of_a, of_b) if side is not None]
+    env, apart = _common_env(known, asked), _starts_apart(known)
+    if apart and asked.episodes:
+        raise InputError("Draws of these sides have starts of their own: leave out --episodes.")
+    starts = sorted(set.union(*apart)) if apart else _common_starts(known, asked)
+    return Prepared((a, b), of_a, of_b, env, starts, apart)
+
+
+def finish(prepared: Prepared, evaluate: Evaluate, alpha: float) -> MatchedSides:
+    """Evaluate checkpoints and judge a against b. Raises as `match` does."""
+    env, starts, apart = prepared.env, prepared.starts, prepared.apart
+    a, b = (
+        side or evaluate(source, env, starts)
+        for source, side in zip(prepared.sources, (prepared.a, prepared.b), strict=True)
+    )
+    either = set.union(*apart) if apart else set.union(*(side.starts or set() for side in (a, b)))
     rates_a, rates_b = (
         [_rate([placed[start] for start in starts if start in placed]) if placed else 0.0 for placed in side.seeds]
-        for side in (sides[a], sides[b])
+        for side in (a, b)
     )
-    judgement = judge(sides[a].units(rates_a), sides[b].units(rates_b), alpha)
-    chances = [None if apart else _chance(side, starts) for side in (sides[a], sides[b])]
     return MatchedSides(
-        sides[a], sides[b], conditions(env), starts, episodes, len(either), rates_a, rates_b, *chances, judgement
+        a,
+        b,
+        conditions(env),
+        starts,
+        max(map(len, apart)) if apart else len(starts),
+        len(either),
+        rates_a,
+        rates_b,
+        chance([a], [starts]),
+        chance([b], [starts]),
+        judge(a.units(rates_a), b.units(rates_b), alpha),
     )
 
 
-def _chance(side: Side, starts: Sequence[int]) -> float | None:
-    finished = [placed for placed in side.seeds if placed is not None]
-    if len(finished) < 2 or side.unit != "seed":
-        return None
-    return spread_by_chance(np.array([[placed[start] for start in starts] for placed in finished]))
+def chance(sides: Sequence[Side], starts: Sequence[Sequence[int]]) -> float | None:
+    """`spread_by_chance` of one side's share, or of its mean over tasks.
+
+    Args:
+        sides: the side in each task.
+        starts: those of each task.
+
+    Returns:
+        None for one seed, where one failed, or where seeds have different starts or share a draw.
+    """
+    parts: dict[int, np.ndarray] = {}
+    for side, own in zip(sides, starts, strict=True):
+        finished = [placed for placed in side.seeds if placed is not None]
+        is_whole = len(finished) == len(side.seeds) > 1 and all({*own} <= placed.keys() for placed in finished)
+        if not is_whole or side.unit != "seed":
+            return None
+        for start in own:
+            met = np.array([placed[start] for placed in finished], dtype=float)
+            parts[start] = parts.get(start, 0) + met / len(own) / len(sides)
+    return spread_by_chance(np.array([*parts.values()]).T)
 
 
 def _rate(placed: Sequence[bool]) -> float:

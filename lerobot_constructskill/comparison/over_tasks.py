@@ -1,24 +1,26 @@
 """Compares two sides over several tasks: in each, and by the mean over tasks of every training seed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.judgement import Judgement, judge
-from lerobot_constructskill.comparison.match import Asked, Evaluate, MatchedSides, match
+from lerobot_constructskill.comparison.match import Asked, Evaluate, MatchedSides, chance, finish, prepare
 from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
-    EVERY,
     IN_STUDY,
     RECORDED,
+    Place,
+    Side,
     Source,
+    is_of_several,
+    place_of,
     read_recorded,
     settings_of,
 )
 from lerobot_constructskill.contract import ANY_ACTION, select_tasks
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.study.rows import read_means
 
 
 @dataclass(frozen=True)
@@ -26,15 +28,18 @@ class OverTasks:
     """Two sides in several tasks.
 
     Args:
+        names: what the user called the sides.
         tasks: setting of a study, or else task, to the sides there; each has the same training seeds in all of them.
-        left_out: side, "A" or "B", to the settings in which the other side alone ran.
+        only_a, only_b: settings or tasks that the other side does not have or name.
         rates_a, rates_b: share of the episodes that placed, the mean over tasks, of each training seed.
         chance_a, chance_b: as in `MatchedSides`, of these means.
         judgement: the statistics of these means.
     """
 
+    names: tuple[str, str]
     tasks: dict[str, MatchedSides]
-    left_out: dict[str, list[str]]
+    only_a: list[str]
+    only_b: list[str]
     rates_a: list[float]
     rates_b: list[float]
     chance_a: float | None
@@ -45,104 +50,112 @@ class OverTasks:
 def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) -> OverTasks | None:
     """Judge a against b in every task of both, and over all of them; None if neither side is of several tasks.
 
-    Checkpoints are of every task: of those of the other side, or of those that were asked for.
+    Checkpoints are of every task of the other side, or of those that were asked for.
 
     Raises:
         MissingError: a side is not there.
         InputError: a side cannot be read, the sides have no task in common, one is of several tasks and the other of
             one, or a side has other training seeds in one of them.
     """
+    wanted = _wanted(asked)
     a, b = (replace(one, recorded=read_recorded(one)) if one.kind == RECORDED else one for one in (a, b))
-    of_a, of_b = (_tasks(source, asked) for source in (a, b))
-    if not any(tasks and len(tasks) > 1 for tasks in (of_a, of_b)) and not (_is_of_several(a) or _is_of_several(b)):
+    of_a, of_b = (_places(one, wanted, asked) for one in (a, b))
+    if not any(is_of_several(one) or len(places or ()) > 1 for one, places in ((a, of_a), (b, of_b))):
         return None
-    names, left_out = _shared(a, b, of_a, of_b)
-    tasks = {}
-    for name, task in names.items():
-        there = replace(asked, env={**asked.env, "task": task}) if "task" in asked.env else asked
-        tasks[name] = match(_in(name, task, a), _in(name, task, b), there, evaluate, alpha)
-    rates_a, rates_b = (np.mean(rates, axis=0) for rates in (_rates(tasks, "a"), _rates(tasks, "b")))
-    one = next(iter(tasks.values()))
+    for one, other in ((a, b), (b, a)):
+        if one.kind == IN_STUDY and not is_of_several(one):
+            several = f"--task={asked.env['task']}" if len(wanted) > 1 else f"'{other.name}'"
+            raise InputError(f"{several} is of several tasks: name '{one.name}' as STUDY:*/VARIANT too.")
+    shared, only_a, only_b = _shared(a, b, of_a, of_b)
+    prepared = {}
+    for name, place in shared.items():
+        there = replace(asked, env={**asked.env, "task": place.task}) if wanted else asked
+        prepared[name] = prepare(_in(name, place, a), _in(name, place, b), there)
+    for letter in "ab":
+        _check_seeds([getattr(one, letter) for one in prepared.values()])
+    tasks = {name: finish(one, evaluate, alpha) for name, one in prepared.items()}
+    matched = list(tasks.values())
+    rates_a, rates_b = (np.mean([getattr(one, f"rates_{letter}") for one in matched], axis=0) for letter in "ab")
     return OverTasks(
+        (a.name, b.name),
         tasks,
-        left_out,
+        only_a,
+        only_b,
         [*rates_a],
         [*rates_b],
-        _chance([matched.chance_a for matched in tasks.values()]),
-        _chance([matched.chance_b for matched in tasks.values()]),
-        judge(one.a.units(rates_a), one.b.units(rates_b), alpha),
+        chance([one.a for one in matched], [one.starts for one in matched]),
+        chance([one.b for one in matched], [one.starts for one in matched]),
+        judge(matched[0].a.units(rates_a), matched[0].b.units(rates_b), alpha),
     )
 
 
-def _tasks(source: Source, asked: Asked) -> dict[str, str] | None:
-    """What a side was evaluated in: settings of a study, or else tasks, to their tasks; None for checkpoints."""
-    if source.kind == IN_STUDY:
-        return settings_of(source)
-    if source.kind == RECORDED:
-        names = dict.fromkeys(one.task for episodes in read_recorded(source).values() for one in episodes)
-        return {name: name for name in names}
+def _wanted(asked: Asked) -> list[str]:
+    """The tasks that were asked for; none if all are meant."""
     if "task" not in asked.env:
-        return None
-    return {row.name: row.name for rows in select_tasks(asked.env["task"], ANY_ACTION).values() for row in rows}
+        return []
+    return [row.name for rows in select_tasks(asked.env["task"], ANY_ACTION).values() for row in rows]
+
+
+def _places(source: Source, wanted: Sequence[str], asked: Asked) -> dict[str, Place] | None:
+    """Where a side acts, by its study's setting or the place's own name; None for checkpoints that act anywhere."""
+    if source.kind == CHECKPOINT:
+        places = [place_of({**asked.env, "task": task}) for task in wanted]
+        return {str(place): place for place in places} or None
+    if source.kind == IN_STUDY:
+        found = settings_of(source)
+    else:
+        of_all = {place_of(vars(one)) for episodes in read_recorded(source).values() for one in episodes}
+        found = {str(place): place for place in sorted(of_all)}
+    return {name: place for name, place in found.items() if place.task in (wanted or [place.task])}
 
 
 def _shared(
-    a: Source, b: Source, of_a: Mapping[str, str] | None, of_b: Mapping[str, str] | None
-) -> tuple[dict[str, str], dict[str, list[str]]]:
-    """The settings or tasks of both sides, and those of one side that the other has not.
-
-    Raises:
-        InputError: there are none, or one side names several and the other one.
-    """
+    a: Source, b: Source, of_a: dict[str, Place] | None, of_b: dict[str, Place] | None
+) -> tuple[dict[str, Place], list[str], list[str]]:
+    """The settings or places of both sides, and those of one side alone. Raises InputError if both have none."""
     if of_a is None or of_b is None:
-        return dict(of_a or of_b or {}), {}
-    for one, other in ((a, b), (b, a)):
-        if one.kind == IN_STUDY and not _is_of_several(one):
-            raise InputError(f"'{other.name}' is of several tasks: name the other side as STUDY:*/VARIANT too.")
-    names = of_a if a.kind == IN_STUDY else of_b
-    by_name = a.kind == b.kind == IN_STUDY
-    first, second = ([*own] if by_name else [*own.values()] for own in (of_a, of_b))
-    shared = {name: task for name, task in names.items() if {name if by_name else task} <= {*first} & {*second}}
+        shared, only_a, only_b = dict(of_a or of_b or {}), [], []
+    elif a.kind == b.kind == IN_STUDY:
+        shared = {name: place for name, place in of_a.items() if name in of_b}
+        only_a, only_b = ([*one.keys() - other.keys()] for one, other in ((of_a, of_b), (of_b, of_a)))
+    else:  # of a study's setting and a recording, the place is the same and the name need not be
+        named = of_b if b.kind == IN_STUDY else of_a
+        shared = {name: place for name, place in named.items() if place in {*of_a.values()} & {*of_b.values()}}
+        only_a, only_b = (
+            [name for name, place in one.items() if place not in other.values()]
+            for one, other in ((of_a, of_b), (of_b, of_a))
+        )
+    if IN_STUDY not in (a.kind, b.kind) and any(not place.perturbation for place in shared.values()):
+        shared = {name: place for name, place in shared.items() if not place.perturbation}
     if not shared:
-        ran = " and ".join(f"'{one.name}' in {', '.join(own) or 'none'}" for one, own in ((a, of_a), (b, of_b)))
+        ran = " and ".join(
+            f"'{one.name}' in {', '.join(own) or 'none'}" for one, own in ((a, of_a), (b, of_b)) if own is not None
+        )
         raise InputError(f"The sides ran in no setting together: {ran}.")
-    left_out = {
-        "A": [name for name in first if name not in second],
-        "B": [name for name in second if name not in first],
-    }
-    return shared, {letter: left for letter, left in left_out.items() if left}
+    return shared, sorted(only_a), sorted(only_b)
 
 
-def _is_of_several(source: Source) -> bool:
-    """Whether a side names several settings of a study, whatever number of them was run."""
-    return source.kind == IN_STUDY and source.arm.partition("/")[0] in (EVERY, *read_means(source.folders[0]))
-
-
-def _in(name: str, task: str, source: Source) -> Source:
+def _in(name: str, place: Place, source: Source) -> Source:
     """The source in one setting or task."""
-    if source.kind == RECORDED:
-        own = {
-            folder: [one for one in episodes if one.task == task] for folder, episodes in read_recorded(source).items()
-        }
-        return replace(source, recorded=own)
     if source.kind == CHECKPOINT:
         return source
-    arm = f"{name}/{source.arm.rpartition('/')[2]}"
-    return replace(source, arm=arm, name=f"{source.folders[0]}:{arm}")
+    if source.kind == IN_STUDY:
+        arm = f"{name}/{source.variant}"
+        return replace(source, arm=arm, name=f"{source.folders[0]}:{arm}")
+    own = {
+        folder: [one for one in episodes if place_of(vars(one)) == place]
+        for folder, episodes in read_recorded(source).items()
+    }
+    if bare := [folder for folder, episodes in own.items() if not episodes]:
+        raise InputError(f"'{bare[0]}' has no recording of {place}: every training seed is recorded in all tasks.")
+    return replace(source, recorded=own)
 
 
-def _chance(each: Sequence[float | None]) -> float | None:
-    """Of means over tasks, from the value in each task."""
-    known = [one for one in each if one is not None]
-    return float(np.hypot.reduce(known)) / len(known) if len(known) == len(each) else None
-
-
-def _rates(tasks: Mapping[str, MatchedSides], letter: str) -> list[list[float]]:
-    """The rates of a side's training seeds in each task."""
-    first, *others = (getattr(matched, letter) for matched in tasks.values())
-    for side in others:
-        if side.numbers != first.numbers or len(side.seeds) != len(first.seeds):
+def _check_seeds(sides: Sequence[Side | None]) -> None:
+    """Refuse a side whose training seeds differ between tasks."""
+    known = [side for side in sides if side is not None]
+    for side in known[1:]:
+        if side.numbers != known[0].numbers or len(side.seeds) != len(known[0].seeds):
             raise InputError(
-                f"'{side.name}' and '{first.name}' have other training seeds: a mean is of the same ones."
+                f"'{side.name}' and '{known[0].name}' have other training seeds: a mean is of the same ones."
             )
-    return [getattr(matched, f"rates_{letter}") for matched in tasks.values()]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from glob import glob
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -161,6 +161,14 @@ class Source:
     arm: str = ""
     recorded: Mapping[Path, Sequence[Episode]] | None = field(default=None, compare=False)
 
+    @property
+    def setting(self) -> str:
+        return self.arm.rpartition("/")[0]
+
+    @property
+    def variant(self) -> str:
+        return self.arm.rpartition("/")[2]
+
 
 def find(text: str) -> Source:
     """Find the source of a side.
@@ -173,9 +181,10 @@ def find(text: str) -> Source:
         MissingError: there is no such folder.
         InputError: the folders hold nothing of this, are of several kinds, or one is named twice.
     """
-    root, _, arm = text.rpartition(":") if ":" in text else (text, "", "")
-    if (Path(root) / STUDY).is_file():
-        return Source(text, IN_STUDY, (Path(root),), arm)
+    parts = text.split(":")
+    for n in range(len(parts), 0, -1):  # a folder's name can have a colon, and so can that of a mean
+        if (root := Path(":".join(parts[:n])) / STUDY).is_file():
+            return Source(text, IN_STUDY, (root.parent,), ":".join(parts[n:]))
     found: list[tuple[str, Path]] = []
     for pattern in text.split(","):
         folders = sorted(Path(name) for name in glob(pattern.strip()) if Path(name).is_dir())
@@ -232,33 +241,56 @@ def read_study(root: Path, arm: str) -> Side:
     )
 
 
-def settings_of(source: Source) -> dict[str, str]:
-    """The settings that a study's side names and its variant ran in, to their tasks, in the study's order.
+class Place(NamedTuple):
+    """Where episodes that are compared are run: the task, and the label of its perturbation."""
+
+    task: str
+    perturbation: str = ""
+
+    def __str__(self) -> str:
+        return self.task + self.perturbation
+
+
+def place_of(env: Mapping[str, Any]) -> Place:
+    """The place of an environment, or of a recording's fields. Raises as `conditions` does."""
+    return Place(*(conditions(env)[name] for name in ("task", "perturbation")))
+
+
+def is_of_several(source: Source) -> bool:
+    """Whether a side names several settings of a study, whatever number of them was run."""
+    return source.kind == IN_STUDY and source.setting in (EVERY, *read_means(source.folders[0]))
+
+
+def settings_of(source: Source) -> dict[str, Place]:
+    """The settings that a study's side names and its variant ran in, in the study's order.
 
     "*" is every setting that is not perturbed; a name of the study's `analysis.means` is the settings of that mean.
 
     Raises:
         MissingError, InputError: as `read_study` does; or "*" would count a task twice.
     """
-    root, (setting, _, variant) = source.folders[0], source.arm.rpartition("/")
+    root = source.folders[0]
     check_folder(root)
-    envs, means, rows = read_environments(root), read_means(root), read_rows(root / ROWS)
-    if setting not in (EVERY, *means):
-        return {setting: envs[setting]["task"]} if setting in envs else {}
-    rows = rows[rows["variant"] == variant]
-    if rows.empty:
-        known = ", ".join(read_rows(root / ROWS)["variant"].unique())
-        raise InputError(f"'{root}' has no variant '{variant}'; it has: {known}.")
-    ran = rows.loc[rows["error_kind"].fillna("") != NOT_RUN, "setting"].unique()
-    if setting in means:
-        return {name: envs[name]["task"] for name in means[setting] if name in ran}
-    tasks = {name: env["task"] for name, env in envs.items() if name in ran and not env.get("perturb")}
-    if twice := [name for name, task in tasks.items() if [*tasks.values()].count(task) > 1]:
+    envs = read_environments(root)
+    if not is_of_several(source):  # `read_study` tells of a setting that is not there
+        return {source.setting: place_of(envs[source.setting])} if source.setting in envs else {}
+    rows = read_rows(root / ROWS)
+    own = rows[rows["variant"] == source.variant]
+    if own.empty:
+        known = ", ".join(rows["variant"].unique())
+        raise InputError(f"'{root}' has no variant '{source.variant}'; it has: {known}.")
+    named = envs if source.setting == EVERY else read_means(root)[source.setting]
+    ran = own.loc[own["error_kind"].fillna("") != NOT_RUN, "setting"].unique()
+    places = {name: place_of(envs[name]) for name in named if name in ran}
+    if source.setting != EVERY:
+        return places
+    found = {name: place for name, place in places.items() if not place.perturbation}
+    if twice := [name for name, place in found.items() if [*found.values()].count(place) > 1]:
         raise InputError(
-            f"'{source.name}' would count {tasks[twice[0]]} more than once ({', '.join(twice)}): name settings under "
+            f"'{source.name}' would count {found[twice[0]]} more than once ({', '.join(twice)}): name settings under "
             f"analysis.means in the study's file, and that mean in place of '{EVERY}'."
         )
-    return tasks
+    return found
 
 
 def _recordings(folder: Path) -> list[Episode]:

@@ -10,7 +10,6 @@ from lerobot_constructskill.analysis.stats.judgement import Judgement
 from lerobot_constructskill.analysis.stats.power import MOST, TARGET
 from lerobot_constructskill.comparison.match import MatchedSides
 from lerobot_constructskill.comparison.over_tasks import OverTasks
-from lerobot_constructskill.comparison.sides import Side
 from lerobot_constructskill.errors import plural
 from lerobot_constructskill.study.rows import merged
 
@@ -42,17 +41,20 @@ def _over_tasks(over: OverTasks, alpha: float) -> str:
     """The output for several tasks: each in a line, then the mean over tasks of every seed."""
     one = next(iter(over.tasks.values()))
     unit = _unit(one)
-    lines = [f"A  {_every(one.a)}", f"B  {_every(one.b)}", f"at most {_steps(over)}, {one.conditions['obs_type']}", ""]
+    lines = [
+        f"{letter}  {name}: {side.kind}" for letter, name, side in zip("AB", over.names, (one.a, one.b), strict=True)
+    ]
+    lines += [f"at most {_steps(over)}, {one.conditions['obs_type']}", ""]
     lines.append(f"{'':24}{'starts':<24}{f'A, mean of {unit}s':<22}B, mean of {unit}s")
     for name, matched in over.tasks.items():
-        starts = f"{matched.starts[0]} to {matched.starts[-1]} ({len(matched.starts)})"
+        starts = _starts(matched)
         a, b = (f"{mean.value:.1%}" for mean in (matched.judgement.mean_a, matched.judgement.mean_b))
         lines.append(f"{name:<24}{starts:<24}{a:<22}{b}")
     means = over.judgement.mean_a, over.judgement.mean_b
     shares = [f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})" for mean in means]
     lines += [f"{'mean over these':<48}{shares[0]:<22}{shares[1]}", ""]
-    for letter, names in over.left_out.items():
-        lines.append(f"{letter} alone ran in {', '.join(names)}: left out.")
+    for letter, names in (("A", over.only_a), ("B", over.only_b)):
+        lines += [f"Left out, as {letter} alone has or names it: {', '.join(names)}."] if names else []
     for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
         seeds = [getattr(matched, letter.lower()).seeds for matched in over.tasks.values()]
         failed = [" (failed)" if None in of_tasks else "" for of_tasks in zip(*seeds, strict=True)]
@@ -70,10 +72,6 @@ def _unit(matched: MatchedSides) -> str:
     return matched.a.unit if matched.a.unit == matched.b.unit else "unit"
 
 
-def _every(side: Side) -> str:
-    return f"{side.name.partition(':')[0]}:*/{side.name.rpartition('/')[2]}: {side.kind}"
-
-
 def _steps(over: OverTasks) -> str:
     lengths = sorted({matched.conditions["episode_length"] for matched in over.tasks.values()})
     return " or ".join(plural(length, "step") for length in lengths)
@@ -89,16 +87,13 @@ def as_json(matched: MatchedSides | OverTasks) -> str:
 
 
 def _sides(matched: MatchedSides, unit: str) -> str:
-    judgement, starts, where = matched.judgement, matched.starts, matched.conditions
-    n = f"{len(starts)}"
-    n += f", {matched.episodes} a draw" * (matched.episodes < len(starts))
-    n += f" of {matched.n_starts} that A or B has" * (matched.n_starts > len(starts))
+    judgement, where = matched.judgement, matched.conditions
     steps = plural(where["episode_length"], "step")
     lines = [
         f"A  {matched.a.name}: {matched.a.kind}",
         f"B  {matched.b.name}: {matched.b.kind}",
         f"in {where['task']}{where['perturbation']}, at most {steps}, {where['obs_type']}",
-        f"starts {starts[0]} to {starts[-1]} ({n})",
+        f"starts {_starts(matched)}",
     ]
     sides = {
         "A": (matched.a, judgement.counts_a, judgement.mean_a, matched.rates_a),
@@ -114,6 +109,15 @@ def _sides(matched: MatchedSides, unit: str) -> str:
         share = f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})"
         lines.append(f"{letter}  {f'{counts.met} of {counts.seeds}':<19}{share:<32}{' '.join(each)}")
     return "\n".join(lines)
+
+
+def _starts(matched: MatchedSides) -> str:
+    """Which starts, and how many: "5000 to 5019 (20 of 50 that A or B has)"."""
+    starts = matched.starts
+    n = f"{len(starts)}"
+    n += f", {matched.episodes} a draw" * (matched.episodes < len(starts))
+    n += f" of {matched.n_starts} that A or B has" * (matched.n_starts > len(starts))
+    return f"{starts[0]} to {starts[-1]} ({n})"
 
 
 def _conclusion(matched: MatchedSides | OverTasks, alpha: float, unit: str) -> str:

@@ -26,12 +26,13 @@ class CompareConfig(Checked):
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
     seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
     output folders of lerobot-train, which are evaluated where the other side was; or recordings of
-    $CONSTRUCTSKILL_RECORD. Two variants are compared over all tasks of a study as results/orders:*/told.
+    $CONSTRUCTSKILL_RECORD. Over several tasks: results/orders:*/told, or a mean of the study in place of "*", beside
+    another such variant, checkpoints or recordings; or two sides of checkpoints with several tasks.
 
     Args:
         a: the first side, the candidate.
         b: the second side, what it is compared with.
-        task: the task, if neither side names one.
+        task: the task, or several with commas, if neither side names one; of sides that have more, these alone.
         obs_type: as of lerobot-eval's --env, if neither side says it; pixels by default.
         episode_length: the same; the task's own by default.
         perturb: the same; none by default.

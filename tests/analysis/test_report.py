@@ -349,6 +349,8 @@ def test_a_mean_over_tasks_is_of_seeds_that_ran_in_all_and_pools_no_episodes(tmp
     }
     assert found["dinov2"].success["placed"].mean.value == pytest.approx(np.mean([*shares.values()]))
     assert [len(found[name].runs) for name in ("dinov2", "clip", "augreg")] == [10, 9, 0]
+    assert 0 < found["clip"].success["placed"].chance < 0.5, "of the seeds that ran in both"
+    assert not mean.drawn and not mean.walls, "a split and a wall are of one task"
     assert ("dinov2", "clip") in {(pair.a, pair.b) for pair in mean.comparisons["placed"]}
     assert "## both" in (Path(report(ReportConfig(tmp_path))).parent / "report.md").read_text()
 

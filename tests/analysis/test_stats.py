@@ -21,7 +21,7 @@ from lerobot_constructskill.analysis.stats.comparisons import (
 from lerobot_constructskill.analysis.stats.components import split
 from lerobot_constructskill.analysis.stats.correlation import _tau_b, kendall
 from lerobot_constructskill.analysis.stats.intervals import clopper_pearson, mean_rate, newcombe
-from lerobot_constructskill.analysis.stats.outcomes import Counts, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import Counts, chance_of, count, runs_of, spread_by_chance
 from lerobot_constructskill.analysis.stats.power import (
     _rejected,
     detectable_spread_ratio,
@@ -138,6 +138,45 @@ def test_conclusions():
     conclusions = [Conclusion.BETTER, Conclusion.WORSE, Conclusion.ALIKE, Conclusion.INCONCLUSIVE]
     assert [comparison.conclusion for comparison in comparisons] == conclusions
     assert comparisons[0].holm == pytest.approx(5 * comparisons[0].boschloo)
+
+
+def test_a_verdict_is_of_means_where_every_seed_succeeds_once():
+    (compared,) = compare({"often": np.full(12, 0.9), "seldom": np.full(12, 0.2)}, [("often", "seldom")])
+    assert compared.conclusion is Conclusion.BETTER and compared.holm == 1
+
+
+def test_alike_seeds_spread_as_single_episodes_do():
+    """Over many studies of five seeds the variance between seeds is that which each study expects by chance."""
+    rng = np.random.default_rng(0)
+    met = rng.random((4000, 5, 20)) < rng.random(20)
+    by_chance = np.mean([spread_by_chance(study / 20) ** 2 for study in met])
+    assert by_chance == pytest.approx(met.mean(axis=2).var(axis=1).mean(), rel=0.03)
+
+
+def episodes_of(placed: dict[str, list[list[bool]]], first: int = 0) -> pd.DataFrame:
+    """Rows of a variant: setting to what each seed placed."""
+    columns = ["setting", "training_seed", "evaluation_seed", "placed", "error_kind"]
+    rows = [
+        (setting, seed, first + start, one, None)
+        for setting, seeds in placed.items()
+        for seed, own in enumerate(seeds)
+        for start, one in enumerate(own)
+    ]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def test_what_chance_gives_is_of_seeds_that_finished_the_same_starts():
+    one = episodes_of({"a": [[True, True, False, True], [True, False, False, True]]})
+    assert chance_of(one, "placed") == pytest.approx(0.5 / 4), "one of four starts, in half of the seeds"
+    other = one.assign(setting="b", evaluation_seed=one["evaluation_seed"] + 100)
+    assert chance_of(pd.concat([one, other]), "placed") == pytest.approx(0.5 / 4 / np.sqrt(2)), "independent tasks"
+    assert chance_of(pd.concat([one, one.assign(setting="b")]), "placed") == pytest.approx(0.5 / 4), (
+        "the same episodes"
+    )
+    assert chance_of(one[one["training_seed"] == 0], "placed") is None, "one seed"
+    assert chance_of(one.drop(index=0), "placed") is None, "other starts"
+    assert chance_of(one.assign(error_kind=["fault", *[None] * 7]), "placed") is None, "a seed that failed"
+    assert chance_of(one.assign(error_kind=NOT_RUN), "placed") is None
 
 
 @pytest.mark.slow

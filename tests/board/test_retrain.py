@@ -68,7 +68,9 @@ def test_whether_an_entry_is_one_policy_is_told_by_its_weights():
     weights = {"a": ["0" * 64, "1" * 64], "b": ["0" * 64, "1" * 64]}
     assert Trained("2" * 64, weights, {}).policies == "one"
     assert Trained("2" * 64, weights | {"b": ["1" * 64, "0" * 64]}, {}).policies == "several"
+    assert Trained("2" * 64, weights | {"b": ["0" * 64, None]}, {}).policies == "one", "of the seeds that have both"
     assert Trained("2" * 64, {"a": weights["a"]}, {}).policies is None
+    assert Trained("2" * 64, dict.fromkeys("ab", [None, None]), {}).policies is None
 
 
 ABOUT = dict.fromkeys(("name", "submitter", "policy", "revision", "data", "training", "compute"), "a test's")

@@ -22,8 +22,8 @@ class Success(NamedTuple):
         exact: share of those seeds with Clopper-Pearson's interval.
         mean: share of episodes, averaged over seeds, with Gaffke's interval.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
-        chance: of that, what single episodes give if seeds do not differ, as `spread_by_chance` says; None where draws
-            stand for seeds, or seeds have different starts.
+        chance: the same, were all seeds alike, as `spread_by_chance` says; None where draws stand for seeds, a seed
+            failed, or seeds have different starts.
     """
 
     counts: Counts
@@ -127,7 +127,7 @@ class SettingFindings:
         return [one for one in self.variants if one.error is not None]
 
     @property
-    def spread(self) -> list[VariantFindings]:
+    def repeated(self) -> list[VariantFindings]:
         """Variants with several seeds, or draws, that have results."""
         return [one for one in self.variants if one.success and one.success["placed"].counts.seeds > 1]
 

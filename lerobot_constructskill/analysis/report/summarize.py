@@ -101,16 +101,24 @@ def _mean(
     means = means.merge(own[[*shares, "heldout_mse_m2"]].mean()).assign(setting=name, heldout_mse_m2_by_data=None)
     whole = means[(own.size()["size"] == len(settings)).to_numpy()]
     seeds = planned[planned["setting"].isin(settings)].drop_duplicates(["variant", "training_seed"])
-    return _setting(analysis, name, seeds.assign(setting=name), whole, rows[rows["setting"].isin(settings)])
+    ran = pd.MultiIndex.from_frame(rows[["variant", "training_seed"]])
+    counted = ran.isin(pd.MultiIndex.from_frame(whole[["variant", "training_seed"]]))
+    own_rows = rows[rows["setting"].isin(settings) & counted]
+    return _setting(analysis, name, seeds.assign(setting=name), whole, own_rows, is_mean=True)
 
 
 def _setting(
-    analysis: Analysis, name: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+    analysis: Analysis,
+    name: str,
+    planned: pd.DataFrame,
+    runs: pd.DataFrame,
+    episodes: pd.DataFrame,
+    is_mean: bool = False,
 ) -> SettingFindings:
     """One setting. Only the tables follow `analysis.order`, so that another order shows the same numbers."""
     of_variants = planned["role"] == VARIANT
     variants, references = (
-        _variants(analysis, planned[chosen], runs, episodes) for chosen in (of_variants, ~of_variants)
+        _variants(analysis, planned[chosen], runs, episodes, is_mean) for chosen in (of_variants, ~of_variants)
     )
     ordered = sorted(variants, key=lambda one: analysis.rank(one.name))
     pairs = analysis.comparisons
@@ -136,19 +144,23 @@ def _setting(
 
 
 def _variants(
-    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame
+    analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame, is_mean: bool
 ) -> list[VariantFindings]:
     return [
-        _variant(analysis.label(name), own, *(table[table["variant"] == name] for table in (runs, episodes)))
+        _variant(analysis.label(name), own, *(table[table["variant"] == name] for table in (runs, episodes)), is_mean)
         for name, own in planned.groupby("variant", sort=False)
     ]
 
 
 def _variant(
-    label: str, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame | None = None
+    label: str,
+    planned: pd.DataFrame,
+    runs: pd.DataFrame,
+    episodes: pd.DataFrame | None = None,
+    is_mean: bool = False,
 ) -> VariantFindings:
     finished = runs["error_kind"].isna().any()
-    of_task = episodes if episodes is not None and episodes["setting"].nunique() == 1 else None
+    of_task = None if is_mean else episodes
     by_data = pd.DataFrame([json.loads(errors) for errors in runs["heldout_mse_m2_by_data"].dropna()])
     return VariantFindings(
         name=planned["variant"].iloc[0],

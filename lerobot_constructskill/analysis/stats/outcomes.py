@@ -63,38 +63,37 @@ def by_unit(rates: Sequence[float] | np.ndarray, units: Sequence[int]) -> np.nda
     return pd.Series(rates, dtype=float).groupby(list(units), sort=False).mean().to_numpy()
 
 
-def spread_by_chance(met: np.ndarray) -> float:
-    """Standard deviation over seeds (divisor n) of the share of episodes that is expected where seeds do not differ.
+def spread_by_chance(parts: np.ndarray) -> float:
+    """The standard deviation over seeds (divisor n) of the share of episodes, were all seeds alike.
 
-    Each start is then met by every seed with one probability of its own, which the seeds that met it estimate. A
-    spread about as large tells nothing of the seeds: more starts make this one smaller.
+    From each start every seed then succeeds with one probability, and its spread is that of single episodes: the root
+    of the sum of their variances over seeds, which is the variance that is expected. A spread about as large tells
+    nothing of the seeds; more starts make this one smaller.
 
     Args:
-        met: whether each seed met the criterion from each start, bool (seeds, starts).
+        parts: what the episodes from each start add to a seed's share, (seeds, starts). Episodes of several tasks from
+            one start stand together, because tasks can look alike there.
     """
-    rates = met.mean(axis=0)
-    return float(np.sqrt((rates * (1 - rates)).sum()) / len(rates))
+    return float(np.sqrt(np.var(parts, axis=0).sum()))
 
 
 def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
-    """`spread_by_chance` of a variant's episodes, or of its mean over settings.
+    """`spread_by_chance` of a variant's share, or of its mean over settings.
 
     Args:
-        episodes: rows of one variant.
+        episodes: rows of one variant, of the seeds that count.
         criterion: one of `CRITERIA`.
 
     Returns:
-        None if fewer than two seeds finished, or they have different starts.
+        None for one seed, where one failed, or where seeds have different starts.
     """
-    each = []
-    for _, own in episodes[episodes["error_kind"].isna()].groupby("setting"):
-        if own.duplicated(["training_seed", "evaluation_seed"]).any():
-            return None
-        met = own.pivot(index="training_seed", columns="evaluation_seed", values=criterion)
-        if len(met) < 2 or met.isna().any(axis=None):
-            return None
-        each.append(spread_by_chance(met.to_numpy(bool)))
-    return float(np.hypot.reduce(each)) / len(each) if each else None
+    made = episodes[episodes["error_kind"].fillna("") != NOT_RUN]
+    where = made.groupby(["training_seed", "setting", "evaluation_seed"]).size().unstack("training_seed")
+    if made["error_kind"].notna().any() or where.shape[1] < 2 or not (where == 1).all(axis=None):
+        return None
+    of_setting = made.groupby(["setting", "training_seed"])[criterion].transform("size")
+    parts = made[criterion].astype(float) / of_setting / made["setting"].nunique()
+    return spread_by_chance(parts.groupby([made["training_seed"], made["evaluation_seed"]]).sum().unstack().to_numpy())
 
 
 def count(rates: np.ndarray) -> Counts:
