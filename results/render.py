@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from lerobot_constructskill.analysis.report.formats import percent
+from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import by_unit, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import by_unit, chance_of, count, runs_of
 from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_rows
 
 ROOT = Path(__file__).parents[1]
@@ -73,6 +73,13 @@ class Arm:
     def episodes(self) -> str:
         return f"{self.met('placed')}: {percent(self.mean.value)} ({_range(self.mean)})"
 
+    def spread(self) -> str:
+        rates = by_unit(self.runs["placed_rate"], self.units)
+        if len(rates) < 2:
+            return "–"
+        chance = chance_of(self.rows, "placed") if self.units.is_unique else None
+        return f"{in_points(rates.std())}, {in_points(chance)}"
+
     def each(self) -> str:
         often = Counter(sorted(self.runs["placed"]))
         return ", ".join(
@@ -103,6 +110,7 @@ HEADS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "lifted": lambda arm: arm.met("lifted"),
     "interval, %": lambda arm: _range(arm.mean),
+    "spread, by chance": Arm.spread,
     "episodes placed (mean over seeds, 95 % interval)": Arm.episodes,
     "seeds that placed": lambda arm: arm.seeds("placed"),
     "seeds that lifted": lambda arm: arm.seeds("lifted"),

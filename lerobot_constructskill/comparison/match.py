@@ -147,12 +147,12 @@ def chance(sides: Sequence[Side], starts: Sequence[Sequence[int]]) -> float | No
         starts: those of each task.
 
     Returns:
-        None for one seed, where one failed, or where seeds have different starts or share a draw.
+        None too where a seed failed, or seeds have different starts or share a draw.
     """
     parts: dict[int, np.ndarray] = {}
     for side, own in zip(sides, starts, strict=True):
         finished = [placed for placed in side.seeds if placed is not None]
-        is_whole = len(finished) == len(side.seeds) > 1 and all({*own} <= placed.keys() for placed in finished)
+        is_whole = len(finished) == len(side.seeds) and all({*own} <= placed.keys() for placed in finished)
         if not is_whole or side.unit != "seed":
             return None
         for start in own:

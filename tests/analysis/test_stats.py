@@ -174,6 +174,7 @@ def test_what_chance_gives_is_of_seeds_that_finished_the_same_starts():
         "the same episodes"
     )
     assert chance_of(one[one["training_seed"] == 0], "placed") is None, "one seed"
+    assert chance_of(one[one["evaluation_seed"] == 1], "placed") is None, "one start"
     assert chance_of(one.drop(index=0), "placed") is None, "other starts"
     assert chance_of(one.assign(error_kind=["fault", *[None] * 7]), "placed") is None, "a seed that failed"
     assert chance_of(one.assign(error_kind=NOT_RUN), "placed") is None

@@ -23,7 +23,7 @@ class Success(NamedTuple):
         mean: share of episodes, averaged over seeds, with Gaffke's interval.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
         chance: the same, were all seeds alike, as `spread_by_chance` says; None where draws stand for seeds, a seed
-            failed, or seeds have different starts.
+            failed, seeds have different starts, or there is one start.
     """
 
     counts: Counts

@@ -63,7 +63,7 @@ def by_unit(rates: Sequence[float] | np.ndarray, units: Sequence[int]) -> np.nda
     return pd.Series(rates, dtype=float).groupby(list(units), sort=False).mean().to_numpy()
 
 
-def spread_by_chance(parts: np.ndarray) -> float:
+def spread_by_chance(parts: np.ndarray) -> float | None:
     """The standard deviation over seeds (divisor n) of the share of episodes, were all seeds alike.
 
     From each start every seed then succeeds with one probability, and its spread is that of single episodes: the root
@@ -73,7 +73,12 @@ def spread_by_chance(parts: np.ndarray) -> float:
     Args:
         parts: what the episodes from each start add to a seed's share, (seeds, starts). Episodes of several tasks from
             one start stand together, because tasks can look alike there.
+
+    Returns:
+        None for one seed or one start, from which seeds and episodes cannot be told apart.
     """
+    if min(parts.shape) < 2:
+        return None
     return float(np.sqrt(np.var(parts, axis=0).sum()))
 
 
@@ -85,11 +90,11 @@ def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
         criterion: one of `CRITERIA`.
 
     Returns:
-        None for one seed, where one failed, or where seeds have different starts.
+        None too where a seed failed, or seeds have different starts.
     """
     made = episodes[episodes["error_kind"].fillna("") != NOT_RUN]
     where = made.groupby(["training_seed", "setting", "evaluation_seed"]).size().unstack("training_seed")
-    if made["error_kind"].notna().any() or where.shape[1] < 2 or not (where == 1).all(axis=None):
+    if made["error_kind"].notna().any() or not (where == 1).all(axis=None):
         return None
     of_setting = made.groupby(["setting", "training_seed"])[criterion].transform("size")
     parts = made[criterion].astype(float) / of_setting / made["setting"].nunique()
