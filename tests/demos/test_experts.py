@@ -1,6 +1,8 @@
 """Experts and noise: pure functions, checked as such, and experts that must succeed on the real simulator."""
 
 from dataclasses import fields, replace
+from itertools import islice
+from math import ceil
 from pathlib import Path
 
 import draccus
@@ -154,9 +156,9 @@ def test_every_expert_succeeds_without_noise_through_all_phases_in_order(env):
 
 @pytest.mark.sim
 def test_every_expert_succeeds_in_as_many_of_ten_noisy_attempts_as_its_row_says(env):
-    expert = make_expert(TASKS[env.task], ExpertConfig())
-    outcomes = [demonstrate(env, expert, NoiseConfig(), DEMO_SEED_START + i)[1] for i in range(10)]
-    assert np.mean(outcomes) >= TASKS[env.task].noisy_yield
+    expert, enough = make_expert(TASKS[env.task], ExpertConfig()), ceil(10 * TASKS[env.task].noisy_yield)
+    outcomes = (demonstrate(env, expert, NoiseConfig(), DEMO_SEED_START + i)[1] for i in range(10))
+    assert len(list(islice(filter(None, outcomes), enough))) == enough, "the rest of the ten is not tried"
 
 
 @pytest.mark.sim
