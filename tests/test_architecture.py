@@ -93,7 +93,7 @@ ARROWS = {
         "perturbations",
         "study.rows",
     ),
-    "comparison.evaluate": ("envs.recording", "rollout", "training"),
+    "comparison.evaluate": ("contract", "envs.recording", "rollout", "training"),
     "scripts": (
         "analysis",
         "artifacts",
