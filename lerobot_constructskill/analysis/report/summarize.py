@@ -147,7 +147,9 @@ def _variants(
     analysis: Analysis, planned: pd.DataFrame, runs: pd.DataFrame, episodes: pd.DataFrame, is_mean: bool
 ) -> list[VariantFindings]:
     return [
-        _variant(analysis.label(name), own, *(table[table["variant"] == name] for table in (runs, episodes)), is_mean)
+        _variant(
+            analysis.label(name), own, runs[runs["variant"] == name], episodes[episodes["variant"] == name], is_mean
+        )
         for name, own in planned.groupby("variant", sort=False)
     ]
 
