@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from synthetic_study import SMALL, missing_rows, write_study
 
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.parsing import read_fields
@@ -93,9 +94,9 @@ def test_a_number_that_comes_from_no_rows_is_found(tmp_path):
 
 
 def test_an_arm_that_nobody_made_is_no_number(tmp_path):
-    page, orders = tmp_path / "page.md", f"{ROOT}/results/orders/report.md"
-    page.write_text(f'[]({orders} "placed brick_to_grey/number")\n')
-    assert render.render(page) == f'[not run yet]({orders} "placed brick_to_grey/number")\n'
-    page.write_text(f'[]({orders} "placed brick_to_grey/nothing")\n')
-    with pytest.raises(SystemExit, match=r"names brick_to_grey/nothing, which its study does not have"):
+    page, small = tmp_path / "page.md", f"{write_study(tmp_path, SMALL, missing_rows(SMALL))}/report.md"
+    page.write_text(f'[]({small} "placed fixed/one")\n')
+    assert render.render(page) == f'[not run yet]({small} "placed fixed/one")\n'
+    page.write_text(f'[]({small} "placed fixed/nothing")\n')
+    with pytest.raises(SystemExit, match=r"names fixed/nothing, which its study does not have"):
         render.render(page)
