@@ -178,10 +178,11 @@ def submit(
         for name, setting in settings.items():
             place = environment_key(**setting.environment)
             there = [one for one in recorded.get(seed, []) if environment_key(**one.environment) == place]
+            starts = [one.evaluation_seed for one in there]
             for start in setting.starts:
                 found = [one for one in there if one.evaluation_seed == start]
                 missing = Claim(start, setting=name, training_seed=seed, error=failures.get(seed))
-                claims.append(_claim(found, missing, setting, [one.evaluation_seed for one in there]))
+                claims.append(_claim(found, missing, setting, starts))
     ended = [claim for claim in claims if claim.error is None]
     if not ended:
         raise InputError("Nothing was recorded.")

@@ -147,18 +147,16 @@ def chance(sides: Sequence[Side], starts: Sequence[Sequence[int]]) -> float | No
         starts: those of each task.
 
     Returns:
-        None too where a seed failed, or seeds have different starts or share a draw.
+        None too where a seed failed, or seeds share a draw.
     """
-    parts: dict[int, np.ndarray] = {}
-    for side, own in zip(sides, starts, strict=True):
-        finished = [placed for placed in side.seeds if placed is not None]
-        is_whole = len(finished) == len(side.seeds) and all({*own} <= placed.keys() for placed in finished)
-        if not is_whole or side.unit != "seed":
-            return None
-        for start in own:
-            met = np.array([placed[start] for placed in finished], dtype=float)
-            parts[start] = parts.get(start, 0) + met / len(own) / len(sides)
-    return spread_by_chance(np.array([*parts.values()]).T)
+    if any(None in side.seeds or side.unit != "seed" for side in sides):
+        return None
+    return spread_by_chance(
+        [
+            [{start: placed[start] for start in own if start in placed} for placed in side.seeds if placed is not None]
+            for side, own in zip(sides, starts, strict=True)
+        ]
+    )
 
 
 def _rate(placed: Sequence[bool]) -> float:

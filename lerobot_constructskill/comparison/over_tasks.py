@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_constructskill.analysis.stats.judgement import Judgement, judge
-from lerobot_constructskill.comparison.match import Asked, Evaluate, MatchedSides, chance, finish, prepare
+from lerobot_constructskill.comparison.match import Asked, Evaluate, MatchedSides, chance, finish, match, prepare
 from lerobot_constructskill.comparison.sides import (
     CHECKPOINT,
     IN_STUDY,
@@ -47,8 +47,8 @@ class OverTasks:
     judgement: Judgement
 
 
-def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) -> OverTasks | None:
-    """Judge a against b in every task of both, and over all of them; None if neither side is of several tasks.
+def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alpha: float) -> OverTasks | MatchedSides:
+    """Judge a against b in every task of both, and over all of them; as `match` does if neither is of several tasks.
 
     Checkpoints are of every task of the other side, or of those that were asked for.
 
@@ -60,10 +60,11 @@ def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alp
     wanted = _wanted(asked)
     a, b = (replace(one, recorded=read_recorded(one)) if one.kind == RECORDED else one for one in (a, b))
     of_a, of_b = (_places(one, wanted, asked) for one in (a, b))
-    if not any(is_of_several(one) or len(places or ()) > 1 for one, places in ((a, of_a), (b, of_b))):
-        return None
+    is_several = {one: is_of_several(one) for one in (a, b)}
+    if not any(is_several.values()) and all(len(places or ()) < 2 for places in (of_a, of_b)):
+        return match(a, b, asked, evaluate, alpha)
     for one, other in ((a, b), (b, a)):
-        if one.kind == IN_STUDY and not is_of_several(one):
+        if one.kind == IN_STUDY and not is_several[one]:
             several = f"--task={asked.env['task']}" if len(wanted) > 1 else f"'{other.name}'"
             raise InputError(f"{several} is of several tasks: name '{one.name}' as STUDY:*/VARIANT too.")
     shared, only_a, only_b = _shared(a, b, of_a, of_b)

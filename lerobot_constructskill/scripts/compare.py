@@ -82,7 +82,7 @@ def compare(config: CompareConfig) -> str:
         SystemExit: A is worse, and `fail_if` says that this fails.
     """
     from lerobot_constructskill.artifacts.folders import staged
-    from lerobot_constructskill.comparison.match import Asked, match
+    from lerobot_constructskill.comparison.match import Asked
     from lerobot_constructskill.comparison.over_tasks import match_over_tasks
     from lerobot_constructskill.comparison.sides import find
     from lerobot_constructskill.comparison.tell import as_json, tell
@@ -97,8 +97,7 @@ def compare(config: CompareConfig) -> str:
             return evaluate(source, env, starts, config.together, config.device, kept_in)
 
         asked = Asked(config.env, config.seed, config.episodes)
-        compared = a, b, asked, evaluated, config.alpha
-        matched = match_over_tasks(*compared) or match(*compared)
+        matched = match_over_tasks(a, b, asked, evaluated, config.alpha)
         if folder:
             folder.mkdir(exist_ok=True)
             (folder / "comparison.json").write_text(as_json(matched), encoding="utf-8")

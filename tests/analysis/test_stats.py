@@ -149,7 +149,7 @@ def test_alike_seeds_spread_as_single_episodes_do():
     """Over many studies of five seeds the variance between seeds is that which each study expects by chance."""
     rng = np.random.default_rng(0)
     met = rng.random((4000, 5, 20)) < rng.random(20)
-    by_chance = np.mean([spread_by_chance(study / 20) ** 2 for study in met])
+    by_chance = np.mean([spread_by_chance([[dict(enumerate(seed)) for seed in study]]) ** 2 for study in met])
     assert by_chance == pytest.approx(met.mean(axis=2).var(axis=1).mean(), rel=0.03)
 
 

@@ -7,15 +7,7 @@ from commands import call
 
 SCRIPT = Path(__file__).with_name("crash_points.py")
 
-SCENARIOS = {
-    "folder": [],
-    "file": [],
-    "store": [],
-    "study": ["30"],
-    "encode": ["20"],
-    "generate": ["15"],
-    "card": ["15"],
-}
+SCENARIOS = {"folder": [], "file": [], "store": [], "study": ["30"], "encode": ["20"], "generate": ["15"], "card": []}
 """How many of a scenario's crash points are tried: all, or so many at equal distances."""
 
 

@@ -101,10 +101,8 @@ def _mean(
     means = means.merge(own[[*shares, "heldout_mse_m2"]].mean()).assign(setting=name, heldout_mse_m2_by_data=None)
     whole = means[(own.size()["size"] == len(settings)).to_numpy()]
     seeds = planned[planned["setting"].isin(settings)].drop_duplicates(["variant", "training_seed"])
-    ran = pd.MultiIndex.from_frame(rows[["variant", "training_seed"]])
-    counted = ran.isin(pd.MultiIndex.from_frame(whole[["variant", "training_seed"]]))
-    own_rows = rows[rows["setting"].isin(settings) & counted]
-    return _setting(analysis, name, seeds.assign(setting=name), whole, own_rows, is_mean=True)
+    episodes = rows[rows["setting"].isin(settings)].merge(whole[["variant", "training_seed"]])
+    return _setting(analysis, name, seeds.assign(setting=name), whole, episodes, is_mean=True)
 
 
 def _setting(

@@ -4,7 +4,7 @@ The seed is the sample. Episodes are counted within their run and never pooled o
 episodes of a run repeat one trajectory (paper, section III).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +63,7 @@ def by_unit(rates: Sequence[float] | np.ndarray, units: Sequence[int]) -> np.nda
     return pd.Series(rates, dtype=float).groupby(list(units), sort=False).mean().to_numpy()
 
 
-def spread_by_chance(parts: np.ndarray) -> float | None:
+def spread_by_chance(tasks: Sequence[Sequence[Mapping[int, bool]]]) -> float | None:
     """The standard deviation over seeds (divisor n) of the share of episodes, were all seeds alike.
 
     From each start every seed then succeeds with one probability, and its spread is that of single episodes: the root
@@ -71,15 +71,24 @@ def spread_by_chance(parts: np.ndarray) -> float | None:
     nothing of the seeds; more starts make this one smaller.
 
     Args:
-        parts: what the episodes from each start add to a seed's share, (seeds, starts). Episodes of several tasks from
-            one start stand together, because tasks can look alike there.
+        tasks: of each task, and there of each seed: start to whether the episode succeeded. The share is the mean over
+            tasks. Their episodes from one start stand together, because tasks can look alike there.
 
     Returns:
-        None for one seed or one start, from which seeds and episodes cannot be told apart.
+        None where seeds have different starts, and for one seed or one start, from which seeds and episodes cannot be
+        told apart.
     """
-    if min(parts.shape) < 2:
+    parts: dict[int, np.ndarray] = {}
+    for seeds in tasks:
+        first = seeds[0]
+        if any(met.keys() != first.keys() for met in seeds):
+            return None
+        for start in first:
+            met = np.array([own[start] for own in seeds], dtype=float)
+            parts[start] = parts.get(start, 0) + met / len(first) / len(tasks)
+    if len(parts) < 2 or min(map(len, tasks)) < 2:
         return None
-    return float(np.sqrt(np.var(parts, axis=0).sum()))
+    return float(np.sqrt(np.var([*parts.values()], axis=1).sum()))
 
 
 def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
@@ -90,15 +99,17 @@ def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
         criterion: one of `CRITERIA`.
 
     Returns:
-        None too where a seed failed, or seeds have different starts.
+        None too where a seed failed, or has a start twice.
     """
     made = episodes[episodes["error_kind"].fillna("") != NOT_RUN]
-    where = made.groupby(["training_seed", "setting", "evaluation_seed"]).size().unstack("training_seed")
-    if made["error_kind"].notna().any() or not (where == 1).all(axis=None):
+    if made["error_kind"].notna().any() or made.duplicated(["setting", "training_seed", "evaluation_seed"]).any():
         return None
-    of_setting = made.groupby(["setting", "training_seed"])[criterion].transform("size")
-    parts = made[criterion].astype(float) / of_setting / made["setting"].nunique()
-    return spread_by_chance(parts.groupby([made["training_seed"], made["evaluation_seed"]]).sum().unstack().to_numpy())
+    return spread_by_chance(
+        [
+            [dict(zip(own["evaluation_seed"], own[criterion], strict=True)) for _, own in of.groupby("training_seed")]
+            for _, of in made.groupby("setting")
+        ]
+    )
 
 
 def count(rates: np.ndarray) -> Counts:
