@@ -15,6 +15,7 @@ from lerobot_constructskill.policies.frozen_vit.language import CONTRACT, NUMBER
 from lerobot_constructskill.policies.frozen_vit.modeling_frozen_vit import FrozenViTChunkPolicy
 from lerobot_constructskill.policies.frozen_vit.train_seeds import save_checkpoint, train_seeds
 from lerobot_constructskill.rollout.offline import heldout_mse
+from lerobot_constructskill.wordings import REWORDINGS
 
 GREY, BLUE = "Put the brick into the grey bin.", "Put the brick into the blue bin."
 TRAINING = {"epochs": 60, "batch_size": 16, "held_out": [6, 7]}
@@ -41,6 +42,26 @@ def error(told_set, config, tmp_path_factory):
         return heldout_mse(folder, told_set, TRAINING["held_out"], backbone_path=filled.backbone_path)
 
     return train
+
+
+def test_a_wording_counts_less_than_the_task():
+    """Also one that is never trained with: its distance from its own task's sentence, by that between two tasks."""
+    orders = [sentence for sentence in REWORDINGS if sentence.startswith("Put the")]
+    told = Told("minilm", [[sentence] for sentence in orders])
+    between = torch.cdist(told(orders), told(orders)).fill_diagonal_(torch.inf).min(dim=1).values
+    for number, sentence in enumerate(orders):
+        for wordings in REWORDINGS[sentence]:
+            distances = torch.cdist(told(wordings), told(orders))
+            assert (distances.argmin(dim=1) == number).all()
+            assert (distances[:, number] < between[number] / 2).all()
+
+
+def test_a_single_tasks_sentence_says_nothing(told_set, config):
+    told = Told("minilm", [[GREY]])
+    assert told([GREY, BLUE]).shape == (2, 0)
+    assert torch.isfinite(told.scale)
+    single = config(language="minilm", sentences=[[GREY]])
+    assert make_policy(single, ds_meta=told_set.meta).heads.film is None
 
 
 @pytest.mark.slow

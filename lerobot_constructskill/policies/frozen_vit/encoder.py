@@ -32,7 +32,7 @@ class EncoderRecord:
         precision: number format of the features that the heads learned from.
         runtime: what computed these features, OpenVINO (on a CPU) or PyTorch; None where a feature set does not say.
         sentence_sha256: hash of the weights of the sentence encoder that the instructions went through; None without.
-        sentence_dim: length of an instruction's vector; None where the policy is told none.
+        sentence_dim: length of the vector that encodes an instruction; None where the policy is told none.
     """
 
     source: str | None = None

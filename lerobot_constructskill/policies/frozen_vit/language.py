@@ -136,18 +136,20 @@ def _folder(name: str) -> Path:
 
 
 class Told(nn.Module):
-    """The vector of an instruction as the heads get it: centred and scaled as the trained sentences are.
+    """The vector of an instruction as the heads get it: where it stands among the trained tasks' sentences.
 
-    Sentences of one benchmark are alike, and what tells them apart is small beside what they share.
+    Of an encoder's vector only the directions are kept in which these sentences differ: one fewer than there are
+    tasks, none for a single task. They hold what tells tasks apart; the hundreds of others hold how it is worded.
 
     Args:
         language: what encodes them, `NUMBER` or the name of a `SentenceEncoder`.
         sentences: of each task the one that it is asked in, then others of the same meaning to train with.
-        dim: length of a vector, D; None asks the encoder.
+        dim: length of an encoder's vector, D; None asks the encoder.
         sha256: hash that the encoder's weights must have; None takes what is found.
     """
 
     mean: Tensor
+    axes: Tensor
     scale: Tensor
 
     def __init__(
@@ -157,23 +159,33 @@ class Told(nn.Module):
         self.language, self.sha256 = language, sha256
         self.numbers = {sentence: number for number, own in enumerate(sentences) for sentence in own}
         self.sentences = {own[0]: list(own) for own in sentences}
+        n_axes = len(self.sentences) - (language != NUMBER)
         if dim is None:
             vectors = self._vectors([*self.sentences])
             mean, dim = vectors.mean(dim=0), vectors.shape[1]
-            scale = (vectors - mean).square().mean().sqrt().clamp(min=1e-3)
+            axes = torch.eye(dim) if language == NUMBER else _axes(vectors - mean, n_axes)
+            scale = (
+                ((vectors - mean) @ axes)
+                .square()
+                .sum()
+                .div(len(vectors) * max(axes.shape[1], 1))
+                .sqrt()
+                .clamp(min=1e-3)
+            )
         else:  # of a checkpoint, which fills them in
-            mean, scale = torch.zeros(dim), torch.ones(())
-        self.dim = dim
+            mean, axes, scale = torch.zeros(dim), torch.zeros(dim, min(n_axes, dim)), torch.ones(())
+        self.encoder_dim, self.dim = axes.shape
         self.register_buffer("mean", mean)
+        self.register_buffer("axes", axes)
         self.register_buffer("scale", scale)
 
     def forward(self, sentences: Sequence[str]) -> Tensor:
-        """Return (B, D) for sentences.
+        """Return (B, `dim`) for sentences.
 
         Raises:
             InputError: it is told by number and was not trained on one of them, or the encoder is another.
         """
-        return (self._vectors(sentences).to(self.mean) - self.mean) / self.scale
+        return (self._vectors(sentences).to(self.mean) - self.mean) @ self.axes / self.scale
 
     def reworded(self, sentences: Sequence[str], rows: Sequence[int]) -> list[str]:
         """The sentences that frames with these rows are told in training: of each task one after the other."""
@@ -197,6 +209,12 @@ class Told(nn.Module):
             known = "; ".join(self.sentences)
             raise InputError(f"The policy was told by number and not trained on '{sentence}', but on: {known}.")
         return self.numbers[sentence]
+
+
+def _axes(centred: Tensor, n: int) -> Tensor:
+    """The first `n` principal axes of centred vectors (N, D), as columns (D, n)."""
+    with one_thread():
+        return torch.linalg.svd(centred, full_matrices=False).Vh[:n].T.contiguous()
 
 
 def sentences_of(meta: Any) -> list[list[str]]:

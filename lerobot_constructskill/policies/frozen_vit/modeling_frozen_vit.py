@@ -232,7 +232,7 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         told = Told(
             config.language, config.sentences, record.sentence_dim, record.sentence_sha256 or config.language_sha256
         )
-        self.encoder_record = replace(record, sentence_sha256=told.sha256, sentence_dim=told.dim)
+        self.encoder_record = replace(record, sentence_sha256=told.sha256, sentence_dim=told.encoder_dim)
         return told
 
     def _check_data_set(self, meta: Any) -> None:
