@@ -47,7 +47,8 @@ class SharedEncoders:
             numbers = [number for number in own if all(key in batches[number] for key in keys)]
             try:
                 each = [cache.pool([batches[number][key] for number in numbers]) for key in keys]
-                pooled = [beside(parts) for parts in zip(*each, strict=True)]
+                with one_thread():
+                    pooled = [beside(parts) for parts in zip(*each, strict=True)]
             except Exception as error:
                 seen |= dict.fromkeys(numbers, error)
                 continue
