@@ -1,7 +1,6 @@
 """Drives many episodes in lockstep with a learner; the expert labels every state with its own action."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ from lerobot_constructskill.demos.demonstrate import came_of_it, decided, seen
 from lerobot_constructskill.demos.expert import Advice, Expert, PrivilegedState
 from lerobot_constructskill.envs.actions import action_bounds
 from lerobot_constructskill.progress import Progress
-from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent
+from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, copies
 from lerobot_constructskill.rollout.simulators import Simulators, Step, simulators
 
 
@@ -108,14 +107,6 @@ def drive_all(
             for lane, step in _unwrap(sims.step(executed).get()).items():
                 if running[lane].add(step, drive):
                     yield running.pop(lane)
-
-
-def copies(learner: Agent, count: int) -> list[Agent]:
-    """Agents that act alike, each with a memory of its own; policies share their weights and processors."""
-    shared = []
-    if isinstance(learner, PolicyAgent):
-        shared = [*learner.policy.children(), learner.preprocessor, learner.postprocessor]
-    return [learner, *(deepcopy(learner, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 
 def _start(seeds: Mapping[int, int], agents: Sequence[Agent], sims: Simulators) -> dict[int, RunningEpisode]:

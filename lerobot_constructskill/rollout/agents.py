@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
+from copy import deepcopy
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -185,7 +186,8 @@ class Lockstep:
 
     A policy class takes part by an attribute `in_lockstep`. Called with its policies by number, it returns a function
     from their preprocessed batches by number to batches that `select_action` takes as well. In place of a batch it may
-    return an exception.
+    return an exception. The attribute also says that nothing of an episode outlasts `reset`, so that copies can share
+    out the episodes of an agent.
     """
 
     def __init__(self, agents: Sequence[Agent]):
@@ -215,6 +217,14 @@ class Lockstep:
         }
         others = acting.keys() - policies.keys()
         return decided | {number: caught(acting[number].act, observations[number]) for number in others}
+
+
+def copies(agent: Agent, count: int) -> list[Agent]:
+    """Agents that act alike, each with a memory of its own; policies share their weights and processors."""
+    shared = []
+    if isinstance(agent, PolicyAgent):
+        shared = [*agent.policy.children(), agent.preprocessor, agent.postprocessor]
+    return [agent, *(deepcopy(agent, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 
 def caught(call: Callable[..., Any], *args: Any) -> Any:

@@ -1,13 +1,12 @@
 """Many agents evaluated in lockstep, with an environment each.
 
 They step in two halves: the environments of one are at work while the agents of the other act. Those of a half that
-share an encoder have one batch of it. An agent that looks at no picture, as the expert, is
-copied: its episodes run side by side, and only the first is rendered.
+share an encoder have one batch of it. Where there are fewer agents than these places, the episodes of one run side by
+side, each with a copy of it. Of an agent that looks at no picture, as the expert, only the first is rendered.
 """
 
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from itertools import batched
 from math import ceil
@@ -24,7 +23,7 @@ from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.plans.measure import measured
 from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.progress import Progress, quiet
-from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent, caught
+from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent, caught, copies
 from lerobot_constructskill.rollout.simulators import Answers, Simulators, Step, simulators
 
 OnStep = Callable[[int, int, np.ndarray, Step], None]
@@ -75,7 +74,7 @@ def roll_out(
     lanes = [
         lane
         for number, (agent, own) in enumerate(zip(agents, seeds, strict=True))
-        for lane in _lanes_of(number, agent, own, env_kwargs, number in filmed, n_workers)
+        for lane in _lanes_of(number, agent, own, env_kwargs, number in filmed, n_workers, len(agents))
     ]
     with (
         simulators([lane.env for lane in lanes], n_workers) as sims,
@@ -116,20 +115,42 @@ class _Lane:
 
 
 def _lanes_of(
-    number: int, agent: Agent, seeds: Sequence[int], env_kwargs: Mapping[str, Any], is_filmed: bool, n_workers: int
+    number: int,
+    agent: Agent,
+    seeds: Sequence[int],
+    env_kwargs: Mapping[str, Any],
+    is_filmed: bool,
+    n_workers: int,
+    n_agents: int,
 ) -> list[_Lane]:
-    """An agent's lanes: one, but for an agent that looks at no camera and is no policy, which may be large."""
+    """An agent's lanes.
+
+    A policy's class says by `in_lockstep` that a copy does what it does; any other policy, which may be large or
+    remember its last episode, has one lane.
+    """
     offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
     looked = getattr(agent, "cameras", offered)
     # At least one picture is rendered, because a row says what backend did it.
     cameras = {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
-    env = env_kwargs if is_filmed else cameras | env_kwargs
-    if looked or isinstance(agent, PolicyAgent) or len(seeds) < 2:
-        return [_Lane(number, agent, 0, seeds, env)]
-    unseen = {**env_kwargs, "render_backend": "none"}
-    shares = [*batched(range(1, len(seeds)), ceil((len(seeds) - 1) / n_workers))]  # noqa: B911  the last may be shorter
-    others = [_Lane(number, deepcopy(agent), share[0], seeds[share[0] : share[-1] + 1], unseen) for share in shares]
-    return [_Lane(number, agent, 0, seeds[:1], env), *others]
+    seen = cameras | env_kwargs
+    if isinstance(agent, PolicyAgent):
+        places = 2 * n_workers if hasattr(type(agent.policy), "in_lockstep") else 1
+        shares, rest = _shares(range(len(seeds)), ceil(places / n_agents)), seen
+    elif looked:
+        shares, rest = [range(len(seeds))], seen
+    else:
+        shares = [range(1), *_shares(range(1, len(seeds)), n_workers)]
+        rest = {**env_kwargs, "render_backend": "none"}
+    envs = [env_kwargs if is_filmed else seen, *[rest] * (len(shares) - 1)]
+    return [
+        _Lane(number, one, share[0], seeds[share[0] : share[-1] + 1], env)
+        for one, share, env in zip(copies(agent, len(shares)), shares, envs, strict=True)
+    ]
+
+
+def _shares(episodes: range, count: int) -> list[Sequence[int]]:
+    """Split episodes into `count` runs of them at most, of nearly the same length."""
+    return [*batched(episodes, ceil(len(episodes) / count))] if episodes else []  # noqa: B911  the last may be shorter
 
 
 def _joined(rollouts: Sequence[Rollout]) -> Rollout:

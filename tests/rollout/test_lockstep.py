@@ -78,6 +78,20 @@ def test_lockstep_equals_lerobot_eval_step_for_step(fields, config, vector):
     assert not np.array_equal(seen[0, 0], seen[1, 0]) and not np.array_equal(seen[0, 0], seen[0, 1])
 
 
+def test_a_policys_episodes_run_side_by_side_where_there_are_fewer_policies_than_places(config, monkeypatch):
+    starts, opened, simulators = range(1000, 1005), [], lockstep.simulators
+    monkeypatch.setattr(lockstep, "simulators", lambda envs, *how: opened.append(envs) or simulators(envs, *how))
+    agent, other = (random_agent(config, seed) for seed in range(2))
+    env = ENV | {"obs_type": "pixels_agent_pos"}
+    ((_, alone),) = roll_out([agent], env, [starts], n_workers=1)
+    ((_, shared),) = roll_out([agent], env, [starts], n_workers=2, filmed=[0])
+    ((_, beside), _) = sorted(roll_out([agent, other], env, [starts] * 2, n_workers=1))
+    cameras = [[one.get("cameras") for one in envs] for envs in opened]
+    assert cameras == [[("base",)] * 2, [None, ("base",), ("base",)], [("base",)] * 2]
+    for found in (shared, beside):
+        assert str(found) == str(alone) and all(map(same_actions, found.episodes, alone.episodes))
+
+
 class Broken:
     """Fails at its third step, or acts in a way that the environment refuses."""
 
