@@ -52,7 +52,7 @@ STUDIES = (
     "base_camera",
     "dart_dagger",
     "perturbed",
-    "orders",
+    "language",
     "walls",
     "other_policies",
 )

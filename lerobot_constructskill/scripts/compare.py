@@ -26,7 +26,7 @@ class CompareConfig(Checked):
     A and B are each a variant of a study, as results/precise:brick_on_brick/precise; or folders, one for each training
     seed, with commas between or as a pattern in quotation marks, such as 'outputs/mine/train/seed_*': checkpoints or
     output folders of lerobot-train, which are evaluated where the other side was; or recordings of
-    $CONSTRUCTSKILL_RECORD. Over several tasks: results/orders:*/told, or a mean of the study in place of "*", beside
+    $CONSTRUCTSKILL_RECORD. Over several tasks: results/language:*/told, or a mean of the study in place of "*", beside
     another such variant, checkpoints or recordings; or two sides of checkpoints with several tasks.
 
     Args:
