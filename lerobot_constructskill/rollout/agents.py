@@ -186,8 +186,8 @@ class Lockstep:
 
     A policy class takes part by an attribute `in_lockstep`. Called with its policies by number, it returns a function
     from their preprocessed batches by number to batches that `select_action` takes as well. In place of a batch it may
-    return an exception. The attribute also says that nothing of an episode outlasts `reset`, so that copies can share
-    out the episodes of an agent.
+    return an exception. The attribute also says that nothing of an episode outlasts `reset`, and that submodules and
+    processors remember nothing between two steps: copies that share these then share out the episodes of an agent.
     """
 
     def __init__(self, agents: Sequence[Agent]):

@@ -1,8 +1,9 @@
 """Many agents evaluated in lockstep, with an environment each.
 
 They step in two halves: the environments of one are at work while the agents of the other act. Those of a half that
-share an encoder have one batch of it. Where there are fewer agents than these places, the episodes of one run side by
-side, each with a copy of it. Of an agent that looks at no picture, as the expert, only the first is rendered.
+share an encoder have one batch of it. Where there are fewer agents than two for each simulator process, an agent's
+episodes run side by side, each share of them with a copy of it. Of an agent that looks at no picture, as the expert,
+only the first episode is rendered.
 """
 
 import json
@@ -25,6 +26,9 @@ from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.progress import Progress, quiet
 from lerobot_constructskill.rollout.agents import Agent, Lockstep, Observation, PolicyAgent, caught, copies
 from lerobot_constructskill.rollout.simulators import Answers, Simulators, Step, simulators
+
+MOST_LANES = 16
+"""Lanes that a few agents are given: one process acts for all of them, and cannot keep more simulators busy."""
 
 OnStep = Callable[[int, int, np.ndarray, Step], None]
 """Called with the agent's number, the episode's, the action and what the environment returned for it."""
@@ -125,8 +129,8 @@ def _lanes_of(
 ) -> list[_Lane]:
     """An agent's lanes.
 
-    A policy's class says by `in_lockstep` that a copy does what it does; any other policy, which may be large or
-    remember its last episode, has one lane.
+    A policy's class says by an `in_lockstep` of its own that a copy does what it does; any other policy, which may be
+    large or remember its last episode, has one lane.
     """
     offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
     looked = getattr(agent, "cameras", offered)
@@ -134,7 +138,7 @@ def _lanes_of(
     cameras = {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
     seen = cameras | env_kwargs
     if isinstance(agent, PolicyAgent):
-        places = 2 * n_workers if hasattr(type(agent.policy), "in_lockstep") else 1
+        places = min(2 * n_workers, MOST_LANES) if "in_lockstep" in vars(type(agent.policy)) else 1
         shares, rest = _shares(range(len(seeds)), ceil(places / n_agents)), seen
     elif looked:
         shares, rest = [range(len(seeds))], seen
@@ -149,8 +153,8 @@ def _lanes_of(
 
 
 def _shares(episodes: range, count: int) -> list[Sequence[int]]:
-    """Split episodes into `count` runs of them at most, of nearly the same length."""
-    return [*batched(episodes, ceil(len(episodes) / count))] if episodes else []  # noqa: B911  the last may be shorter
+    """Split episodes into at most `count` shares; the last may be shorter than the others."""
+    return [*batched(episodes, ceil(len(episodes) / count))] if episodes else []  # noqa: B911
 
 
 def _joined(rollouts: Sequence[Rollout]) -> Rollout:

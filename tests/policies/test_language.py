@@ -56,12 +56,18 @@ def test_a_wording_counts_less_than_the_task():
             assert (distances[:, number] < between[number] / 2).all()
 
 
-def test_a_single_tasks_sentence_says_nothing(told_set, config):
+def test_a_single_tasks_sentence_says_nothing(told_set, config, caplog):
     told = Told("minilm", [[GREY]])
     assert told([GREY, BLUE]).shape == (2, 0)
     assert torch.isfinite(told.scale)
     single = config(language="minilm", sentences=[[GREY]])
     assert make_policy(single, ds_meta=told_set.meta).heads.film is None
+    assert "asked in one sentence, so language=minilm tells the policy nothing" in caplog.text
+
+
+def test_sentences_that_an_encoder_takes_for_one_say_nothing():
+    told = Told("minilm", [[GREY], [GREY.upper()]])
+    assert told([GREY, BLUE]).eq(0).all()
 
 
 @pytest.mark.slow

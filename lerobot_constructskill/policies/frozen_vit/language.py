@@ -139,7 +139,7 @@ class Told(nn.Module):
     """The vector of an instruction as the heads get it: where it stands among the trained tasks' sentences.
 
     Of an encoder's vector only the directions are kept in which these sentences differ: one fewer than there are
-    tasks, none for a single task. They hold what tells tasks apart; the hundreds of others hold how it is worded.
+    sentences, none for a single one. The hundreds of others mostly hold how something is worded.
 
     Args:
         language: what encodes them, `NUMBER` or the name of a `SentenceEncoder`.
@@ -149,7 +149,7 @@ class Told(nn.Module):
     """
 
     mean: Tensor
-    axes: Tensor
+    axes: Tensor | None
     scale: Tensor
 
     def __init__(
@@ -159,25 +159,22 @@ class Told(nn.Module):
         self.language, self.sha256 = language, sha256
         self.numbers = {sentence: number for number, own in enumerate(sentences) for sentence in own}
         self.sentences = {own[0]: list(own) for own in sentences}
-        n_axes = len(self.sentences) - (language != NUMBER)
-        if dim is None:
-            vectors = self._vectors([*self.sentences])
-            mean, dim = vectors.mean(dim=0), vectors.shape[1]
-            axes = torch.eye(dim) if language == NUMBER else _axes(vectors - mean, n_axes)
-            scale = (
-                ((vectors - mean) @ axes)
-                .square()
-                .sum()
-                .div(len(vectors) * max(axes.shape[1], 1))
-                .sqrt()
-                .clamp(min=1e-3)
-            )
-        else:  # of a checkpoint, which fills them in
-            mean, axes, scale = torch.zeros(dim), torch.zeros(dim, min(n_axes, dim)), torch.ones(())
-        self.encoder_dim, self.dim = axes.shape
-        self.register_buffer("mean", mean)
-        self.register_buffer("axes", axes)
-        self.register_buffer("scale", scale)
+        self.encoder_dim = dim or self._vectors([*self.sentences]).shape[1]
+        n_axes = min(len(self.sentences) - 1, self.encoder_dim)
+        self.dim = self.encoder_dim if language == NUMBER else n_axes
+        self.register_buffer("mean", torch.zeros(self.encoder_dim))
+        self.register_buffer("axes", None if language == NUMBER else torch.zeros(self.encoder_dim, n_axes))
+        self.register_buffer("scale", torch.ones(()))
+        if dim is None:  # else a checkpoint fills them in
+            self._fit()
+
+    def _fit(self) -> None:
+        vectors = self._vectors([*self.sentences])
+        self.mean = vectors.mean(dim=0)
+        if self.axes is not None:
+            self.axes = _axes(vectors - self.mean, self.dim)
+        placed = self._place(vectors)
+        self.scale = placed.square().sum().div(max(placed.numel(), 1)).sqrt().clamp(min=1e-3)
 
     def forward(self, sentences: Sequence[str]) -> Tensor:
         """Return (B, `dim`) for sentences.
@@ -185,12 +182,16 @@ class Told(nn.Module):
         Raises:
             InputError: it is told by number and was not trained on one of them, or the encoder is another.
         """
-        return (self._vectors(sentences).to(self.mean) - self.mean) @ self.axes / self.scale
+        return self._place(self._vectors(sentences).to(self.mean)) / self.scale
 
     def reworded(self, sentences: Sequence[str], rows: Sequence[int]) -> list[str]:
         """The sentences that frames with these rows are told in training: of each task one after the other."""
         ways = [self.sentences.get(sentence, [sentence]) for sentence in sentences]
         return [own[row % len(own)] for own, row in zip(ways, rows, strict=True)]
+
+    def _place(self, vectors: Tensor) -> Tensor:
+        centred = vectors - self.mean
+        return centred if self.axes is None else centred @ self.axes
 
     def _vectors(self, sentences: Sequence[str]) -> Tensor:
         if self.language == NUMBER:
@@ -212,9 +213,11 @@ class Told(nn.Module):
 
 
 def _axes(centred: Tensor, n: int) -> Tensor:
-    """The first `n` principal axes of centred vectors (N, D), as columns (D, n)."""
+    """The first `n` principal axes of centred vectors (N, D), as columns (D, n); zero where they do not differ."""
     with one_thread():
-        return torch.linalg.svd(centred, full_matrices=False).Vh[:n].T.contiguous()
+        _, lengths, axes = torch.linalg.svd(centred, full_matrices=False)
+    differ = lengths > 1e-4 * lengths[0].clamp(min=1e-3)
+    return (axes * differ[:, None])[:n].T.contiguous()
 
 
 def sentences_of(meta: Any) -> list[list[str]]:

@@ -232,6 +232,11 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         told = Told(
             config.language, config.sentences, record.sentence_dim, record.sentence_sha256 or config.language_sha256
         )
+        if not told.dim:
+            logger.warning(
+                f"Every task of the data set is asked in one sentence, so language={config.language} tells the policy "
+                "nothing."
+            )
         self.encoder_record = replace(record, sentence_sha256=told.sha256, sentence_dim=told.encoder_dim)
         return told
 
