@@ -129,19 +129,18 @@ def _lanes_of(
 ) -> list[_Lane]:
     """An agent's lanes.
 
-    A policy's class says by an `in_lockstep` of its own that a copy does what it does; any other policy, which may be
-    large or remember its last episode, has one lane.
+    A policy whose class has an `in_lockstep` of its own has several, and so has an agent that looks at no camera. Any
+    other has one: it may be large, or remember its last episode.
     """
     offered = OBS_TYPES.get(env_kwargs.get("obs_type", "pixels"), ())
     looked = getattr(agent, "cameras", offered)
     # At least one picture is rendered, because a row says what backend did it.
     cameras = {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
     seen = cameras | env_kwargs
-    if isinstance(agent, PolicyAgent):
-        places = min(2 * n_workers, MOST_LANES) if "in_lockstep" in vars(type(agent.policy)) else 1
-        shares, rest = _shares(range(len(seeds)), ceil(places / n_agents)), seen
-    elif looked:
-        shares, rest = [range(len(seeds))], seen
+    if isinstance(agent, PolicyAgent) or looked:
+        is_shared = isinstance(agent, PolicyAgent) and "in_lockstep" in vars(type(agent.policy))
+        count = ceil(min(2 * n_workers, MOST_LANES) / n_agents) if is_shared else 1
+        shares, rest = _shares(range(len(seeds)), count), seen
     else:
         shares = [range(1), *_shares(range(1, len(seeds)), n_workers)]
         rest = {**env_kwargs, "render_backend": "none"}
