@@ -215,8 +215,9 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
             f"{who} has frames of several seeds.": len(set(data.column("sim.seed")[span])) > 1,
             f"{who} goes on after its end, or ends before its last frame.": done[:-1].any() or not done[-1],
             f"{who} of a round goes on after its success.": is_round and success[:-1].any(),
+            # A hand that is above the object from the start has nothing to do in the first phase.
             f"{who} does not go through the six phases in order.": not is_round
-            and list(dict.fromkeys(phases)) != list(Phase),
+            and [*dict.fromkeys(phases)] not in ([*Phase], [*Phase][1:]),
             f"{who} does not end in success.": not is_round and not success[-1],
         }
     )
@@ -231,11 +232,12 @@ def check_timestamps(data: DataSet) -> Iterator[str]:
 def check_duplicates(data: DataSet) -> Iterator[str]:
     """Noisy demonstrations never repeat one another; frames never stand still while a moving arm is told to move.
 
-    A learner does repeat itself in a task whose initial state is always the same.
+    A learner does repeat itself in a task whose initial state is always the same. In two tasks that differ in the size
+    of the bin alone, an attempt of one seed is the same twice, but for what is seen.
     """
     executed, seen = data.column("dart.executed_action"), {}
     for episode, span in enumerate(data.spans() if data.config.noise.root.any() else ()):
-        first = seen.setdefault(executed[span].tobytes(), episode)
+        first = seen.setdefault((data.task_of(episode), executed[span].tobytes()), episode)
         if first != episode and data.rounds[span.start] == 0:
             yield f"Episode {episode} repeats episode {first}."
     still = (np.diff(data.column("observation.state"), axis=0) == 0).all(axis=1)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -134,13 +134,21 @@ class DataSet:
     rows: pd.DataFrame
     episodes: pd.DataFrame
     tasks: list[str]
+    _columns: dict[str, np.ndarray] = field(init=False, repr=False, default_factory=dict)
 
     def column(self, name: str) -> np.ndarray:
-        """A column as (N, ...) array; (N,) where a frame holds one value.
+        """A column as (N, ...) array, which is not to be changed; (N,) where a frame holds one value.
+
+        It is read and checked once: checks ask for columns episode by episode.
 
         Raises:
             InputError: the frames have no such column, or its values are not of the shape that info.json tells.
         """
+        if name not in self._columns:
+            self._columns[name] = self._read_column(name)
+        return self._columns[name]
+
+    def _read_column(self, name: str) -> np.ndarray:
         if name not in self.rows:
             raise InputError(f"data/ has no column {name}.")
         if name not in self.info["features"]:

@@ -256,6 +256,11 @@ def test_nothing_is_wrong_with_a_data_set_as_it_was_generated(name, pristine):
     assert complaints(open_dataset(pristine), CHECKS[name]) == []
 
 
+def test_a_hand_may_be_above_the_object_from_the_start(copy):
+    column("phase", lambda phases: np.where(phases == "PREGRASP", "DESCEND", phases))(copy)
+    assert complaints(open_dataset(copy), CHECKS["Episodes"]) == []
+
+
 @pytest.mark.parametrize("name", CORRUPTIONS)
 def test_a_planted_corruption_is_found_and_named(name, copy):
     corrupt, check, words = CORRUPTIONS[name]
