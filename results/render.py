@@ -5,6 +5,9 @@ column by its head (`HEADS`). A link whose title begins with one of `WORDS` has 
 
     | finer maps | 489/500 | 68 to 99 | [precise](results/precise/report.md "brick_to_bin_shifted/precise") |
     | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |
+
+In place of a setting there may stand one of the study's `means`: each seed that ran in all of its settings is then
+counted once, with the episodes of all of them.
 """
 
 import json
@@ -16,10 +19,11 @@ from functools import cache
 from pathlib import Path
 
 import pandas as pd
+import yaml
 
 from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
-from lerobot_constructskill.analysis.stats.outcomes import by_unit, chance_of, count, runs_of
+from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, by_unit, chance_of, count, runs_of
 from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_rows
 
 ROOT = Path(__file__).parents[1]
@@ -31,25 +35,31 @@ PAGES = [
     *sorted((ROOT / "results").glob("*/notes.md")),
 ]
 
-LINK = re.compile(r'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>\w+) )?(?P<arm>\w+/\w+)"\)')
-
 OFTEN = ["", "", " (two)", " (three)", " (four)", " (five)", " (six)", " (seven)", " (eight)", " (nine)", " (ten)"]
 """How often a number stands in a list; above, in digits."""
 
 
 class Arm:
-    """What the rows of a study say of one variant in one setting.
+    """What the rows of a study say of one variant in one setting, or in all settings of a mean.
+
+    Args:
+        rows: of the study.
+        draws: of its demonstrations and starts.
+        means: its settings by the name of their mean. They have as many episodes each.
+        name: setting/variant, or mean/variant.
 
     Raises:
         SystemExit: the study has no such arm.
     """
 
-    def __init__(self, rows: pd.DataFrame, draws: Draws, name: str):
+    def __init__(self, rows: pd.DataFrame, draws: Draws, means: dict[str, list[str]], name: str):
         setting, variant = name.split("/")
-        self.rows = rows[(rows["setting"] == setting) & (rows["variant"] == variant)]
-        if self.rows.empty:
+        settings = means.get(setting, [setting])
+        own = rows[rows["setting"].isin(settings) & (rows["variant"] == variant)]
+        if own.empty:
             raise SystemExit(f"A page names {name}, which its study does not have.")
-        self.runs = runs_of(self.rows)
+        self.runs = _over(runs_of(own), len(settings))
+        self.rows = own[own["training_seed"].isin(self.runs["training_seed"])]
         self.draws, self.units = (self.runs["training_seed"].map(of) for of in (draws.of, draws.unit))
 
     def tell(self, number: Callable[["Arm"], str]) -> str:
@@ -106,6 +116,10 @@ WORDS: dict[str, Callable[[Arm], str]] = {
 }
 """Of links."""
 
+LINK = re.compile(
+    rf'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>{"|".join(WORDS)}) )?(?P<arm>[\w, ]+/\w+)"\)'
+)
+
 HEADS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "lifted": lambda arm: arm.met("lifted"),
@@ -145,7 +159,7 @@ def literals(page: Path) -> list[str]:
 def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Each line as rendered; if it is one of a table, the table's heads and its cells."""
     heads: list[str] = []
-    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder)))
+    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder), _means(folder)))
     arms = cache(lambda file, name: Arm(*study((page.parent / file).resolve().parent), name))
     for line in page.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
@@ -163,6 +177,21 @@ def _linked(link: re.Match[str], arms: Callable[[str, str], Arm]) -> str:
         return link[0]
     text = arms(link["file"], link["arm"]).tell(WORDS[link["word"]])
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
+
+
+def _over(runs: pd.DataFrame, settings: int) -> pd.DataFrame:
+    """One row for each seed that ran in so many settings: sums of its counts, means of its shares and errors."""
+    counted = ["episodes", *CRITERIA]
+    shares = [*(f"{criterion}_rate" for criterion in CRITERIA), "heldout_mse_m2"]
+    of_seeds = runs.groupby("training_seed")
+    over = of_seeds[counted].sum().join(of_seeds[shares].mean())
+    return over[of_seeds.size() == settings].reset_index()
+
+
+def _means(folder: Path) -> dict[str, list[str]]:
+    """The settings of each mean that a study's report shows."""
+    study = yaml.safe_load((folder / "study.yaml").read_text(encoding="utf-8"))
+    return study.get("analysis", {}).get("means", {})
 
 
 def _range(estimate: Estimate) -> str:

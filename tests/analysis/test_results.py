@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from synthetic_study import SMALL, missing_rows, write_study
+from synthetic_study import SMALL, episode_rows, missing_rows, planned, write_study
 
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.parsing import read_fields
@@ -91,6 +91,16 @@ def test_a_number_that_comes_from_no_rows_is_found(tmp_path):
     page.write_text(f"| task | placed | rows |\n|---|---:|---|\n| tile | 1/500 | {link} |\n| other | 3/500 | |\n")
     assert f"| tile | 397/500 | {link} |" in render.render(page)
     assert render.literals(page) == ["| other | 3/500 | |"]
+
+
+def test_a_mean_counts_each_seed_that_ran_in_all_of_its_settings(tmp_path):
+    study = SMALL | {"settings": {"fixed": SMALL["settings"]["fixed"], "moved": SMALL["settings"]["fixed"]}}
+    study |= {"analysis": {"means": {"both tasks": ["fixed", "moved"]}}}
+    runs = [run for run in planned(study) if run != ("moved", "one", 1)]
+    rows = [row for run in runs for row in episode_rows(study, run, 2, 1 + (run[0] == "moved"))]
+    page, report_file = tmp_path / "page.md", f"{write_study(tmp_path, study, rows)}/report.md"
+    page.write_text(f'[]({report_file} "placed both tasks/one") []({report_file} "each both tasks/two")\n')
+    assert [one["text"] for one in render.LINK.finditer(render.render(page))] == ["3/4", "3, 3"]
 
 
 def test_an_arm_that_nobody_made_is_no_number(tmp_path):
