@@ -70,15 +70,24 @@ def seeds_figure(findings: Findings) -> Figure:
     made = [one for one in findings.sections if any(len(own.runs) for own in one.variants)]
     sections = made or findings.sections
     stacked = {setting.name: len(_seeds_of(setting)) > MOST_BESIDE for setting in sections}
-    heights = [(1 + stacked[one.name]) * (0.75 + 0.3 * len(one.variants)) + 0.2 for one in sections]
+    titles = {
+        one.name: [fill(f"{one.label}: {criterion}", 44) for criterion in CRITERIA]
+        if len(findings.sections) > 1
+        else [criterion.capitalize() for criterion in CRITERIA]
+        for one in sections
+    }
+    heights = [
+        (1 + stacked[one.name]) * (0.75 + 0.3 * len(one.variants) + 0.15 * titles[one.name][0].count("\n")) + 0.2
+        for one in sections
+    ]
     figure = Figure(figsize=(WIDTH, sum(heights)), layout="constrained")
     parts = figure.subfigures(len(sections), 1, squeeze=False, height_ratios=heights)[:, 0]
     for part, setting in zip(parts, sections, strict=True):
         rows, columns = (2, 1) if stacked[setting.name] else (1, 2)
         axes = part.subplots(rows, columns, sharey=True)
-        for axis, criterion in zip(axes, CRITERIA, strict=True):
+        for axis, criterion, title in zip(axes, CRITERIA, titles[setting.name], strict=True):
             _draw_seeds(axis, setting, criterion, findings.episodes)
-            axis.set(title=f"{setting.label}: {criterion}" if len(findings.sections) > 1 else criterion.capitalize())
+            axis.set(title=title)
         axes[0].set_yticks(np.arange(len(setting.variants)) + 0.5, [fill(one.label, 24) for one in setting.variants])
         axes[0].invert_yaxis()
     return figure
