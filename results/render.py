@@ -6,8 +6,8 @@ column by its head (`HEADS`). A link whose title begins with one of `WORDS` has 
     | finer maps | 489/500 | 68 to 99 | [precise](results/precise/report.md "brick_to_bin_shifted/precise") |
     | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |
 
-In place of a setting there may stand one of the study's `means`: each seed that ran in all of its settings is then
-counted once, with the episodes of all of them.
+The name of one of the study's `means` may stand in place of a setting: each seed that ran in all of its settings is
+then counted once, with the episodes of all of them.
 """
 
 import json
@@ -19,12 +19,11 @@ from functools import cache
 from pathlib import Path
 
 import pandas as pd
-import yaml
 
 from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, by_unit, chance_of, count, runs_of
-from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_rows
+from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_means, read_rows
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,20 +44,23 @@ class Arm:
     Args:
         rows: of the study.
         draws: of its demonstrations and starts.
-        means: its settings by the name of their mean. They have as many episodes each.
+        means: its settings by the name of their mean.
         name: setting/variant, or mean/variant.
 
     Raises:
-        SystemExit: the study has no such arm.
+        SystemExit: the study has no such arm, or a run of a mean failed.
     """
 
     def __init__(self, rows: pd.DataFrame, draws: Draws, means: dict[str, list[str]], name: str):
         setting, variant = name.split("/")
         settings = means.get(setting, [setting])
         own = rows[rows["setting"].isin(settings) & (rows["variant"] == variant)]
-        if own.empty:
+        if {*own["setting"]} != {*settings}:
             raise SystemExit(f"A page names {name}, which its study does not have.")
-        self.runs = _over(runs_of(own), len(settings))
+        runs = runs_of(own)
+        if len(settings) > 1 and runs["episodes"].nunique() > 1:
+            raise SystemExit(f"A page names {name}, whose runs have different numbers of episodes.")
+        self.runs = _over(runs, len(settings))
         self.rows = own[own["training_seed"].isin(self.runs["training_seed"])]
         self.draws, self.units = (self.runs["training_seed"].map(of) for of in (draws.of, draws.unit))
 
@@ -117,7 +119,7 @@ WORDS: dict[str, Callable[[Arm], str]] = {
 """Of links."""
 
 LINK = re.compile(
-    rf'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>{"|".join(WORDS)}) )?(?P<arm>[\w, ]+/\w+)"\)'
+    rf'\[(?P<text>[^\]]*)\]\((?P<file>[^ )]*report\.md) "(?:(?P<word>{"|".join(WORDS)}) )?(?P<arm>[^"/]+/\w+)"\)'
 )
 
 HEADS: dict[str, Callable[[Arm], str]] = {
@@ -159,7 +161,7 @@ def literals(page: Path) -> list[str]:
 def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
     """Each line as rendered; if it is one of a table, the table's heads and its cells."""
     heads: list[str] = []
-    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder), _means(folder)))
+    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder), read_means(folder)))
     arms = cache(lambda file, name: Arm(*study((page.parent / file).resolve().parent), name))
     for line in page.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
@@ -173,9 +175,10 @@ def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
 
 def _linked(link: re.Match[str], arms: Callable[[str, str], Arm]) -> str:
     """A link with its number as its text; one of a row of a table as it is."""
+    arm = arms(link["file"], link["arm"])
     if link["word"] is None:
         return link[0]
-    text = arms(link["file"], link["arm"]).tell(WORDS[link["word"]])
+    text = arm.tell(WORDS[link["word"]])
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
 
 
@@ -186,12 +189,6 @@ def _over(runs: pd.DataFrame, settings: int) -> pd.DataFrame:
     of_seeds = runs.groupby("training_seed")
     over = of_seeds[counted].sum().join(of_seeds[shares].mean())
     return over[of_seeds.size() == settings].reset_index()
-
-
-def _means(folder: Path) -> dict[str, list[str]]:
-    """The settings of each mean that a study's report shows."""
-    study = yaml.safe_load((folder / "study.yaml").read_text(encoding="utf-8"))
-    return study.get("analysis", {}).get("means", {})
 
 
 def _range(estimate: Estimate) -> str:

@@ -163,12 +163,13 @@ def check_noise(data: DataSet) -> Iterator[str]:
 def _advice(data: DataSet, rows: np.ndarray) -> np.ndarray:
     """The actions that the expert advises in some frames, (n, channels)."""
     experts = {block.task.name: make_expert(block.task, data.config.expert) for block in data.blocks}
-    known = {name: data.column(f"sim.{name}") for name in SIM_STATE if f"sim.{name}" in data.columns}
-    states = ({name: np.atleast_1d(values[row]) for name, values in known.items()} for row in rows)
     asked = [experts[data.task_of(episode).name] for episode in data.column("episode_index")[rows]]
-    return np.array(
-        [expert.advise(PrivilegedState(**state)).action for expert, state in zip(asked, states, strict=True)]
-    )
+    return np.array([expert.advise(_state(data, row)).action for expert, row in zip(asked, rows, strict=True)])
+
+
+def _state(data: DataSet, row: int) -> PrivilegedState:
+    known = [name for name in SIM_STATE if f"sim.{name}" in data.columns]
+    return PrivilegedState(**{name: np.atleast_1d(data.column(f"sim.{name}")[row]) for name in known})
 
 
 def check_episodes(data: DataSet) -> Iterator[str]:
@@ -215,12 +216,26 @@ def _check_episode(data: DataSet, span: slice, who: str, episode) -> Iterator[st
             f"{who} has frames of several seeds.": len(set(data.column("sim.seed")[span])) > 1,
             f"{who} goes on after its end, or ends before its last frame.": done[:-1].any() or not done[-1],
             f"{who} of a round goes on after its success.": is_round and success[:-1].any(),
-            # A hand that is above the object from the start has nothing to do in the first phase.
             f"{who} does not go through the six phases in order.": not is_round
-            and [*dict.fromkeys(phases)] not in ([*Phase], [*Phase][1:]),
+            and not _are_in_order(data, span.start, phases),
             f"{who} does not end in success.": not is_round and not success[-1],
         }
     )
+
+
+def _are_in_order(data: DataSet, first: int, phases: np.ndarray) -> bool:
+    """Whether a demonstration, whose first row is given, goes through the six phases.
+
+    It begins with the second one where the hand is above the object from the start.
+    """
+    found, wanted = [*dict.fromkeys(phases)], [*Phase]
+    if found == wanted:
+        return True
+    if found[0] != wanted[1] or [phase for phase in found if phase != wanted[0]] != wanted[1:]:
+        return False
+    state = _state(data, first)
+    expert = make_expert(data.task_of(data.column("episode_index")[first]), data.config.expert)
+    return expert.act(state, expert.start(state))[1] == wanted[1]
 
 
 def check_timestamps(data: DataSet) -> Iterator[str]:
@@ -232,12 +247,12 @@ def check_timestamps(data: DataSet) -> Iterator[str]:
 def check_duplicates(data: DataSet) -> Iterator[str]:
     """Noisy demonstrations never repeat one another; frames never stand still while a moving arm is told to move.
 
-    A learner does repeat itself in a task whose initial state is always the same. In two tasks that differ in the size
-    of the bin alone, an attempt of one seed is the same twice, but for what is seen.
+    A learner does repeat itself in a task whose initial state is always the same. Two tasks that differ only in the
+    size of the bin can have the same actions from one seed, in other pictures.
     """
-    executed, seen = data.column("dart.executed_action"), {}
+    executed, bins, seen = data.column("dart.executed_action"), data.column("sim.bin_interior"), {}
     for episode, span in enumerate(data.spans() if data.config.noise.root.any() else ()):
-        first = seen.setdefault((data.task_of(episode), executed[span].tobytes()), episode)
+        first = seen.setdefault((executed[span].tobytes(), bins[span.start].tobytes()), episode)
         if first != episode and data.rounds[span.start] == 0:
             yield f"Episode {episode} repeats episode {first}."
     still = (np.diff(data.column("observation.state"), axis=0) == 0).all(axis=1)

@@ -134,10 +134,10 @@ class DataSet:
     rows: pd.DataFrame
     episodes: pd.DataFrame
     tasks: list[str]
-    _columns: dict[str, np.ndarray] = field(init=False, repr=False, default_factory=dict)
+    _columns: dict[str, np.ndarray] = field(init=False, repr=False, compare=False, default_factory=dict)
 
     def column(self, name: str) -> np.ndarray:
-        """A column as (N, ...) array, which is not to be changed; (N,) where a frame holds one value.
+        """A column as (N, ...) array, which cannot be written to; (N,) where a frame holds one value.
 
         It is read and checked once: checks ask for columns episode by episode.
 
@@ -161,6 +161,8 @@ class DataSet:
         column = np.stack(values) if len(np.shape(values.iloc[0])) else values.to_numpy()
         if kind in NUMBERS and column.dtype.kind not in NUMBERS[kind]:
             raise InputError(f"{name} has values that are no {kind}, as info.json says, or lacks some.")
+        column = column.view()
+        column.setflags(write=False)
         return column
 
     @cached_property

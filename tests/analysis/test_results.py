@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from synthetic_study import SMALL, episode_rows, missing_rows, planned, write_study
+from synthetic_study import SMALL, episode_rows, failed_row, missing_row, missing_rows, planned, write_study
 
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.parsing import read_fields
@@ -95,12 +95,39 @@ def test_a_number_that_comes_from_no_rows_is_found(tmp_path):
 
 def test_a_mean_counts_each_seed_that_ran_in_all_of_its_settings(tmp_path):
     study = SMALL | {"settings": {"fixed": SMALL["settings"]["fixed"], "moved": SMALL["settings"]["fixed"]}}
-    study |= {"analysis": {"means": {"both tasks": ["fixed", "moved"]}}}
-    runs = [run for run in planned(study) if run != ("moved", "one", 1)]
-    rows = [row for run in runs for row in episode_rows(study, run, 2, 1 + (run[0] == "moved"))]
+    study |= {"analysis": {"means": {"both, again": ["fixed", "moved"]}}}
+    rows = [
+        row
+        for run in planned(study)
+        for row in (
+            [missing_row(study, run)]
+            if run == ("moved", "one", 1)
+            else episode_rows(study, run, 2, 1 + (run[0] == "moved") * run[2])
+        )
+    ]
     page, report_file = tmp_path / "page.md", f"{write_study(tmp_path, study, rows)}/report.md"
-    page.write_text(f'[]({report_file} "placed both tasks/one") []({report_file} "each both tasks/two")\n')
-    assert [one["text"] for one in render.LINK.finditer(render.render(page))] == ["3/4", "3, 3"]
+    page.write_text(f'[]({report_file} "placed both, again/one") []({report_file} "each both, again/two")\n')
+    assert [one["text"] for one in render.LINK.finditer(render.render(page))] == ["2/4", "2, 3"]
+    page.write_text(f'| spread, by chance | rows |\n|---|---|\n| | [small]({report_file} "both, again/two") |\n')
+    assert "| 12.5, " in render.render(page)  # 2 and 3 of 4
+
+
+def test_a_mean_with_a_failed_run_is_no_number(tmp_path):
+    study = SMALL | {"settings": {"fixed": SMALL["settings"]["fixed"], "moved": SMALL["settings"]["fixed"]}}
+    study |= {"analysis": {"means": {"both": ["fixed", "moved"]}}}
+    runs = [*planned(study)]
+    rows = [failed_row(study, runs[0], "broken"), *(row for run in runs[1:] for row in episode_rows(study, run, 2, 1))]
+    page = tmp_path / "page.md"
+    page.write_text(f'[]({write_study(tmp_path, study, rows)}/report.md "placed both/one")\n')
+    with pytest.raises(SystemExit, match="names both/one, whose runs have different numbers of episodes"):
+        render.render(page)
+
+
+def test_a_mistyped_word_of_a_link_is_refused(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(f'[5]({ROOT}/results/precise/report.md "plcaed tile_to_grid/precise")\n')
+    with pytest.raises(SystemExit, match="names plcaed tile_to_grid/precise"):
+        render.render(page)
 
 
 def test_an_arm_that_nobody_made_is_no_number(tmp_path):

@@ -187,6 +187,11 @@ CORRUPTIONS = {
     "another instruction's number": (column("task_index", at(7, 1)), "Episodes", "another instruction .* in 1 frame"),
     "no instruction": (metadata("meta/info.json", lambda i: i.update(total_tasks=0)), "Episodes", "total_tasks is 0"),
     "a wrong total": (metadata("meta/info.json", lambda i: i.update(total_frames=7)), "Episodes", "total_frames is 7"),
+    "a first phase that is called the second": (
+        column("phase", lambda phases: np.where(phases == "PREGRASP", "DESCEND", phases)),
+        "Episodes",
+        "six phases in order",
+    ),
     "phases out of order": (column("phase", at(slice(0, 3), "CARRY")), "Episodes", "six phases in order"),
     "a failed demonstration": (column("next.success", lambda s: s & False), "Episodes", "Episode 0 does not end"),
     "two seeds in an episode": (column("sim.seed", at(3, 1_000_007)), "Episodes", "several seeds"),
@@ -257,7 +262,17 @@ def test_nothing_is_wrong_with_a_data_set_as_it_was_generated(name, pristine):
 
 
 def test_a_hand_may_be_above_the_object_from_the_start(copy):
-    column("phase", lambda phases: np.where(phases == "PREGRASP", "DESCEND", phases))(copy)
+    """Then there is nothing to do in the first phase."""
+    config = open_dataset(copy).config.expert
+
+    def above(table):
+        is_first = (table["episode_index"] == 0) & (table["phase"] == "PREGRASP")
+        x, y, z = table["sim.object_pose"][0][:3]
+        height = z + table["sim.object_size"][0][2] / 2 - config.finger_depth + config.pregrasp_clearance
+        table.at[0, "sim.tcp_pose"] = np.array([x, y, height, 0, 1, 0, 0], dtype=np.float32)
+        return table.assign(phase=table["phase"].mask(is_first, "DESCEND"))
+
+    rows(above)(copy)
     assert complaints(open_dataset(copy), CHECKS["Episodes"]) == []
 
 

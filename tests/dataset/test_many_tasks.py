@@ -51,6 +51,19 @@ def test_a_set_of_several_tasks_passes_every_check(pristine):
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
 
 
+@pytest.mark.parametrize("is_another_bin", [False, True])
+def test_another_task_may_have_the_same_actions_for_another_bin(copy, is_another_bin):
+    path = copy / "data/chunk-000/file-000.parquet"
+    table = pd.read_parquet(path)
+    again = table[table["episode_index"] == 0].assign(episode_index=3)
+    if is_another_bin:
+        again["sim.bin_interior"] = [interior + np.float32(0.01) for interior in again["sim.bin_interior"]]
+    before, after = (table[table["episode_index"] < 3], table[table["episode_index"] > 3])
+    pd.concat([before, again, after], ignore_index=True).to_parquet(path)
+    found = complaints(open_dataset(copy), CHECKS["Duplicates"])
+    assert found == ([] if is_another_bin else ["Episode 3 repeats episode 0."])
+
+
 def test_lerobot_reads_the_instruction_of_each_task_and_we_the_name(pristine):
     dataset = LeRobotDataset("local/toy", root=pristine)
     assert dataset.meta.episodes[TASK_NAME] == NAMES

@@ -13,6 +13,7 @@ from lerobot_constructskill.contract import (
     REWARD_LIFTED,
     REWARD_PLACED,
     SIM_STATE,
+    TASKS,
 )
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
@@ -31,11 +32,12 @@ class ToyEnv:
 
     def __init__(self, task, obs_type, episode_length, light_robot=None, cameras=None, action="task"):
         self.cameras, self.episode_length = cameras or OBS_TYPES[obs_type], episode_length
+        self.offset = 0.001 * [*TASKS].index(task)
 
     def reset(self, seed):
         self.seed, self.steps, self.settled, self.lifted = seed, 0, 0, False
         self.tcp = np.array([0.0, 0.0, 0.17])
-        self.object = np.array([0.002 * (seed % 7), 0.0, 0.05])
+        self.object = np.array([0.002 * (seed % 7) + self.offset, 0.0, 0.05])
         self.grip = 1.0
         coarse = np.random.default_rng(seed).integers(0, 255, (8, 8, 3), dtype=np.uint8)
         self.background = coarse.repeat(IMAGE_SIZE // 8, axis=0).repeat(IMAGE_SIZE // 8, axis=1)

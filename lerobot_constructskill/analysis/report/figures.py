@@ -71,7 +71,7 @@ def seeds_figure(findings: Findings) -> Figure:
     sections = made or findings.sections
     stacked = {setting.name: len(_seeds_of(setting)) > MOST_BESIDE for setting in sections}
     titles = {
-        one.name: [fill(f"{one.label}: {criterion}", 44) for criterion in CRITERIA]
+        one.name: [fill(f"{one.label}: {criterion}", 44 * (1 + stacked[one.name])) for criterion in CRITERIA]
         if len(findings.sections) > 1
         else [criterion.capitalize() for criterion in CRITERIA]
         for one in sections
