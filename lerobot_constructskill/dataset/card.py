@@ -115,6 +115,7 @@ def card_facts(data: DataSet) -> dict[str, Any]:
                 "noise_mm": [round(1000 * float(value), 2) for value in noise[phases == phase].std(axis=0)],
             }
             for phase in Phase
+            if (phases == phase).any()
         },
         "action_range": _action_range(data),
     }

@@ -20,22 +20,20 @@ SHEET_EPISODES, PATH_EPISODES = 3, 20
 
 
 def contact_sheet(data: DataSet, path: Path) -> None:
-    """A row for each of some episodes and cameras: the start of each phase, and the last frame."""
+    """A row for each of some episodes and cameras: the start of each phase that it has, and the last frame."""
     episodes = _firsts(data, SHEET_EPISODES)
     spans = [data.spans()[episode] for episode in episodes]
-    phases = data.column("phase")
-    wanted = [
-        [*(span.start + int(np.argmax(phases[span] == phase)) for phase in Phase), span.stop - 1] for span in spans
-    ]
-    lines = [(camera, rows) for rows in wanted for camera in data.cameras]
-    until = max(row for rows in wanted for row in rows) + 1
+    lines = [(camera, _starts(data, span)) for span in spans for camera in data.cameras]
+    until = max(span.stop for span in spans)
     shown = {camera: dict(islice(pictures(data, camera), until)) for camera in data.cameras}
-    figure = Figure(figsize=(1.6 * len(wanted[0]), 1.75 * len(lines)), layout="constrained")
-    axes = figure.subplots(len(lines), len(wanted[0]), squeeze=False)
+    titles = [*Phase, "last frame"]
+    figure = Figure(figsize=(1.6 * len(titles), 1.75 * len(lines)), layout="constrained")
+    axes = figure.subplots(len(lines), len(titles), squeeze=False)
     for index, (camera, rows) in enumerate(lines):
-        for axis, row, title in zip(axes[index], rows, [*Phase, "last frame"], strict=True):
-            axis.imshow(shown[camera][row])
+        for axis, row, title in zip(axes[index], rows, titles, strict=True):
             axis.set(xticks=[], yticks=[])
+            if row is not None:
+                axis.imshow(shown[camera][row])
             if index == 0:
                 axis.set_title(title, fontsize=9, color=COLOURS.get(title, "black"))
         axes[index, 0].set_ylabel(
@@ -65,6 +63,13 @@ def trajectories(data: DataSet, path: Path) -> None:
         axis.plot([], [], color=colour, label=phase)
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=7, fontsize=8, frameon=False)
     _save(figure, path)
+
+
+def _starts(data: DataSet, span: slice) -> list[int | None]:
+    """The rows where an episode's phases begin, none for one that it does not have, and its last row."""
+    own = data.column("phase")[span]
+    begins = [own == phase for phase in Phase]
+    return [*(span.start + int(one.argmax()) if one.any() else None for one in begins), span.stop - 1]
 
 
 def _firsts(data: DataSet, most: int) -> list[int]:

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from toy import ToyEnv
 from lerobot_constructskill.contract import CAMERAS, FPS, OBS_TYPES, TASKS
 from lerobot_constructskill.dataset.card import MEANINGS, card_facts, render
 from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.dataset.plots import contact_sheet
 from lerobot_constructskill.demos import shards
 from lerobot_constructskill.demos.columns import LANGUAGE, SIDECAR, dagger_features, demonstration_features
+from lerobot_constructskill.demos.expert import Phase
 from lerobot_constructskill.demos.metadata import CONTRACT, file_hashes, modality
 from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError
@@ -53,6 +56,18 @@ def test_the_card_counts_what_there_is(card, data):
     low, high = np.quantile(data.column("action")[:, 0], [0.01, 0.99])
     found = re.search(r"dx (-?[\d.]+) to (-?[\d.]+)", card)
     np.testing.assert_allclose([float(found[1]), float(found[2])], [low, high], atol=1e-3)
+
+
+def test_a_phase_that_no_demonstration_has_is_neither_counted_nor_shown(data, tmp_path):
+    without = replace(data, rows=data.rows.assign(phase=data.rows["phase"].replace(Phase.PREGRASP, Phase.DESCEND)))
+    card = render(card_facts(without))
+    assert f"| {Phase.DESCEND} |" in card and f"| {Phase.PREGRASP} |" not in card and "nan" not in card
+    sheets = {name: tmp_path / f"{name}.jpg" for name in ("with", "without")}
+    contact_sheet(data, sheets["with"])
+    contact_sheet(without, sheets["without"])
+    before, after = (np.asarray(Image.open(sheet)).mean(axis=2) for sheet in sheets.values())
+    cell = np.s_[before.shape[0] // 6, before.shape[1] // 12 : before.shape[1] // 8]
+    assert (after[cell] == 255).all() and not (before[cell] == 255).all()
 
 
 def test_the_card_of_another_task_evaluates_that_task_and_tells_its_noise(data):
