@@ -17,13 +17,14 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
     """Measure the held-out errors that are not known yet; those that cannot be measured are logged and stay unknown.
 
     Args:
-        runs: those whose policies are validated.
+        runs: those whose policies are validated, where the store has them.
         others: the other runs of their study, which are not asked for.
         times: folder of the file that says what took how long.
     """
-    pairs = list_pairs(runs, others)
+    kept = [run for run in runs if run.checkpoints and store.has(run.checkpoints)]
+    pairs = list_pairs(kept, [*others, *(run for run in runs if run not in kept)])
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
-        nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
+        nodes = [heldout(run, data) for run in kept if run.arm is arm]
         due = [node for node in nodes if not store.has(node)]
         if not due:
             continue

@@ -18,7 +18,7 @@ from lerobot_constructskill.artifacts import pools, revisions
 from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.revisions import BEFORE
-from lerobot_constructskill.artifacts.store import LOG, Store
+from lerobot_constructskill.artifacts.store import LOG, Machine, Store
 from lerobot_constructskill.errors import InputError, MachineError, UserError, kind_of
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
@@ -43,7 +43,7 @@ from lerobot_constructskill.study.spec import Options, Setting, Study, Variant
 from lerobot_constructskill.study.status import status
 from lerobot_constructskill.study.table import Table
 from lerobot_constructskill.study.timing import TIMINGS, entries, time_by_stage, timed
-from lerobot_constructskill.study.validate import heldout, list_pairs
+from lerobot_constructskill.study.validate import heldout, list_pairs, validate
 from lerobot_constructskill.training.heldout import FILE
 from lerobot_constructskill.training.recipe import Training
 
@@ -116,6 +116,20 @@ def test_a_part_of_a_study_is_validated_on_no_demonstrations_of_the_rest():
     assert validated("") == fixed | alone
     assert validated("fixed/most/seed_0") == {("fixed", "most", most)} and validated("alone") == alone
     assert validated("fixed/own/seed_1,fixed/more") == {one for one in fixed if most not in one and "most" not in one}
+
+
+def test_demonstrations_of_policies_that_were_trained_elsewhere_are_not_made_again(tmp_path, monkeypatch):
+    """Their rows are here and their checkpoints are not, as in a clone of results."""
+    policy = {"type": "frozen_vit", "backbone": "dinov2_vits14"}
+    variants = {"here": Variant(policy, seeds=1), "elsewhere": Variant(policy, seeds=1, data="--episodes=8")}
+    here, elsewhere = runs = list_runs(study(variants=variants, references={}))
+    store, asked = Store(tmp_path / "store"), []
+    with store.claim([here.checkpoints]), store.writing(here.checkpoints) as folder:
+        folder.mkdir()
+    monkeypatch.setattr(Store, "get_all", lambda self, nodes, machine: asked.extend(nodes) or {})
+    validate(runs, [], store, Machine(), tmp_path)
+    assert {node.checkpoints for node in asked} == {here.checkpoints}
+    assert [node.demonstrations for node in asked] == [here.arm.demonstrations.node]
 
 
 def test_demonstrations_and_environment_have_one_action():
