@@ -17,7 +17,7 @@ from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.protocol import CLAIMED, STANDARD
 from lerobot_constructskill.board.recovered import TABLE as RECOVERED
 from lerobot_constructskill.board.submission import SCHEMA, Claim
-from lerobot_constructskill.contract import REWARD_LIFTED, REWARD_PLACED
+from lerobot_constructskill.contract import LOOSE, REWARD_LIFTED, REWARD_PLACED, SUITES
 
 TABLE, EXPORTS = "board.parquet", "exports"
 EVAL_INFO, EVAL_RESULTS = "eval_info.json", ".eval_results/constructskill.yaml"
@@ -57,13 +57,30 @@ def write_table(entries: Iterable[Entry], path: Path) -> None:
 
 
 def eval_info(entry: Entry, seed: int) -> dict[str, Any]:
-    """What `lerobot-eval` would have written of one training seed, but for times and films."""
+    """What `lerobot-eval` would have written of one training seed, but for times and films.
+
+    LeRobot's comparison of two such files pairs tasks by their group and number.
+    """
     per_task = [
-        {"task_group": setting, "task_id": 0, "metrics": _metrics(standing.claims[seed])}
+        {**_place(entry, setting), "metrics": _metrics(standing.claims[seed])}
         for setting, standing in entry.standings.items()
     ]
-    groups = {task["task_group"]: _aggregate([task]) for task in per_task}
-    return {"per_task": per_task, "per_group": groups, "overall": _aggregate(per_task)}
+    groups: dict[str, list[dict]] = {}
+    for task in per_task:
+        groups.setdefault(task["task_group"], []).append(task)
+    per_group = {group: _aggregate(tasks) for group, tasks in groups.items()}
+    return {"per_task": per_task, "per_group": per_group, "overall": _aggregate(per_task)}
+
+
+def _place(entry: Entry, setting: str) -> dict[str, Any]:
+    """A setting's group and number, as `lerobot-eval` gives them; a custom setting is a group by itself."""
+    said = entry.declaration
+    if said.settings_class != STANDARD:
+        return {"task_group": setting, "task_id": 0}
+    task, label = said.settings[setting].task, said.settings[setting].perturbation
+    if task in (suite := SUITES.get(said.suite, ())):
+        return {"task_group": said.suite + label, "task_id": suite.index(task)}
+    return {"task_group": LOOSE + label, "task_id": 0}
 
 
 def _metrics(claims: list[Claim]) -> dict[str, list]:

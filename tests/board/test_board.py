@@ -20,9 +20,10 @@ from lerobot_constructskill.board import films, verification
 from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.explained import meaning
 from lerobot_constructskill.board.exports import eval_info, write_exports, write_table
-from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, BoardSetting
+from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, STANDARD, BoardSetting
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
+from lerobot_constructskill.contract import SUITES
 from lerobot_constructskill.errors import InputError, MissingError
 
 BOARD = Path(__file__).parents[2] / "board"
@@ -40,6 +41,12 @@ class Page(HTMLParser):
         for name, value in attributes:
             if name in self.found:
                 self.found[name].add(value)
+
+
+@pytest.fixture(scope="module")
+def committed():
+    """The entries of the board that is kept here."""
+    return read_entries(BOARD)[0]
 
 
 @pytest.fixture(scope="module")
@@ -70,18 +77,17 @@ def many(valid, tmp_path_factory):
     return root
 
 
-def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
+def test_every_committed_entry_was_replayed_and_is_on_its_page(committed, tmp_path):
     texts = {path.stem: path.read_text() for path in write_board(BOARD, tmp_path, "alice/bench")}
     pages = {name: Page(text) for name, text in texts.items()}
-    entries, _ = read_entries(BOARD)
     for name, suite in BOARD_SUITES.items():
-        shown = [one for entry in entries if entry.declaration.suite == name for one in entry.standings]
+        shown = [one for entry in committed if entry.declaration.suite == name for one in entry.standings]
         assert texts[name].count('class="interval"') == len(shown)
         assert all(str(escape(meaning(one))) in texts[name] for one in suite.settings.values())
         assert len(pages[name].found["src"]) >= len({one.task for one in suite.settings.values()})
     others = json.loads((tmp_path / "exports" / "leaderboard.json").read_text())
-    assert entries and pages.keys() == {"index", *BOARD_SUITES}
-    for entry in entries:
+    assert committed and pages.keys() == {"index", *BOARD_SUITES}
+    for entry in committed:
         assert entry.level == "replayed"
         assert entry.name in pages[entry.declaration.suite].found["id"]
         path = tmp_path / "exports" / entry.name / ".eval_results/constructskill.yaml"
@@ -97,8 +103,8 @@ def test_every_committed_entry_was_replayed_and_is_on_its_page(tmp_path):
         assert all((tmp_path / link).is_file() for link in links)
         assert {link[1:] for link in page.found["href"] if link.startswith("#")} <= page.found["id"]
     table = pq.read_table(tmp_path / "board.parquet")
-    assert table.num_rows == sum(len(entry.submission.claims) for entry in entries)
-    for few in ([], [entry for entry in entries if entry.is_reference][:1]):
+    assert table.num_rows == sum(len(entry.submission.claims) for entry in committed)
+    for few in ([], [entry for entry in committed if entry.is_reference][:1]):
         write_table(few, tmp_path / "few.parquet")
         assert pq.read_schema(tmp_path / "few.parquet").equals(table.schema), "whatever entries there are"
 
@@ -136,8 +142,8 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     assert ranks([bad, other], "block_to_bin") == {"bad": (1, False), "other": (1, False)}, "from other starts"
 
 
-def test_only_what_was_replayed_is_for_the_boards_of_others(many, tmp_path):
-    entries = [replace(entry, level=level) for entry in read_entries(BOARD)[0] for level in ("claimed", "replayed")]
+def test_only_what_was_replayed_is_for_the_boards_of_others(committed, many, tmp_path):
+    entries = [replace(entry, level=level) for entry in committed for level in ("claimed", "replayed")]
     standard = {
         entry.name for entry in entries if entry.declaration.settings_class == "standard" and not entry.is_reference
     }
@@ -303,14 +309,28 @@ def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypa
     assert lengths == [HORIZON + 1] and (tmp_path / "film.mp4").exists()
 
 
-def test_rewards_are_those_of_the_environment():
-    expert = next(entry for entry in read_entries(BOARD)[0] if entry.name == "bins_expert")
+def test_rewards_are_those_of_the_environment(committed):
+    expert = next(entry for entry in committed if entry.name == "bins_expert")
     info = eval_info(expert, 0)
     assert info["overall"]["n_episodes"] == 101 and info["overall"]["pc_success"] == 100
     (fixed,) = expert.standings["brick_to_bin"].claims[0]
     metrics = info["per_task"][0]["metrics"]
     assert metrics["max_rewards"] == [1.0] and metrics["successes"] == [True]
     assert metrics["sum_rewards"] == [0.5 * (fixed.steps - fixed.lift_step) + 1.0]
+
+
+def test_an_export_names_tasks_as_lerobot_eval_does(committed):
+    """LeRobot's comparison pairs them by these; `test_lerobots_evaluation.py` says what lerobot-eval writes."""
+    seen = set()
+    for entry in committed:
+        info = eval_info(entry, entry.declaration.training_seeds[0])
+        places = [(task["task_group"], task["task_id"]) for task in info["per_task"]]
+        seen.add(suite := entry.declaration.suite)
+        if entry.declaration.settings_class == STANDARD and suite in SUITES:
+            assert places == [(suite, number) for number in range(len(SUITES[suite]))], entry.name
+        assert len({*places}) == len(places) and {group for group, _ in places} == {*info["per_group"]}
+        assert sum(group["n_episodes"] for group in info["per_group"].values()) == info["overall"]["n_episodes"]
+    assert {"bins", "ladder", "joints", "orders", "perturbed"} <= seen
 
 
 def test_an_episode_that_failed_with_an_error_has_no_reward(many):
