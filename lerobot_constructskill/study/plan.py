@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from itertools import groupby
+from itertools import chain, groupby
 from typing import Any
 
 from lerobot.envs import EnvConfig
@@ -13,7 +13,7 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
-from lerobot_constructskill.envs.gym_env import resolve_rendering
+from lerobot_constructskill.envs.gym_env import perturbed_task, resolve_rendering
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.policy_types import decode_policy
@@ -123,6 +123,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
         check_inputs(learner.config, common["env"]["obs_type"], data.node.config.seen)
+        _check_told(learner, data, common["env"])
     starts = {"demonstrations": data.node.starts, "evaluation": common["starts"]}
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
@@ -133,6 +134,22 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     return Arm(
         name=name, role=VARIANT, demonstrations=data, learner=learner, training=training, rounds=rounds, **common
     )
+
+
+def _check_told(learner: Learner, data: NamedSet, env: Mapping[str, Any]) -> None:
+    """Refuse an instruction that a policy which is told one will not know: that of no task that it learns from.
+
+    A sentence encoder also takes other wordings of these tasks; told by number, a policy knows the trained ones alone.
+    """
+    language = getattr(learner.config, "language", None)
+    if language is None:
+        return
+    tasks, levels = data.node.config.rows, 1 if language == "number" else None
+    known = {word for task in tasks for word in (task.instruction, *chain(*task.rewordings[:levels]))}
+    asked = perturbed_task(env["task"], env["perturb"], env["perturb_seed"])[0].instruction
+    if asked not in known:
+        trained = "; ".join(dict.fromkeys(task.instruction for task in tasks))
+        raise InputError(f"It is told '{asked}', on which nothing is trained; '{data.name}' is asked: {trained}")
 
 
 def _rounds(study: Study, name: str, variant: Variant, data: NamedSet) -> DaggerConfig:

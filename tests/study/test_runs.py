@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from errno import ENOENT, ENOSPC, ESTALE
 from pathlib import Path
@@ -19,6 +20,7 @@ from lerobot_constructskill.artifacts.failures import Failure
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.revisions import BEFORE
 from lerobot_constructskill.artifacts.store import LOG, Machine, Store
+from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import InputError, MachineError, UserError, kind_of
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
@@ -138,6 +140,27 @@ def test_demonstrations_and_environment_have_one_action():
     many = Setting("smoke --task=bins,brick_to_bin_turned --action=full", ENV | {"action": "full"})
     assert {run.arm.env["action"] for run in list_runs(study(settings={"fixed": many}))} == {"full"}
     assert not any("action" in run.arm.env for run in list_runs(study()))
+
+
+@pytest.mark.parametrize(
+    ("language", "data", "env", "refused"),
+    [
+        ("minilm", "suite/orders", {"task": "brick_to_grey"}, None),
+        ("minilm", "suite/orders", {"task": "brick_to_grey", "perturb": "language=3"}, None),
+        ("minilm", "suite/orders", {"task": "brick_to_grey", "perturb": "wrong_task=1"}, None),
+        ("minilm", "suite/orders", {"task": "brick_on_brick"}, get_task("brick_on_brick").instruction),
+        ("minilm", "suite/orders --task=block_to_grey", {"task": "brick_to_grey"}, "brick"),
+        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "language=1"}, None),
+        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "language=3"}, "It is told"),
+        (None, "suite/orders", {"task": "brick_on_brick"}, None),
+    ],
+)
+def test_an_instruction_that_nothing_was_trained_on_is_refused_before_anything_is_made(language, data, env, refused):
+    told = {"policy": {"type": "frozen_vit", "backbone": "dinov2_vits14", "language": language}, "seeds": 1}
+    many = study(settings={"one": Setting(data, ENV | env)}, variants={"told": Variant(**told)}, references={})
+    said = rf"variants\.told\.policy: .*{refused}.* nothing is trained; '{data}'"
+    with pytest.raises(InputError, match=said) if refused else nullcontext():
+        list_runs(many)
 
 
 def test_seeds_with_demonstrations_of_their_own_have_no_attempt_in_common():
