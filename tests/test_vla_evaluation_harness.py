@@ -22,13 +22,23 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from random_features import config, tiny_weights  # noqa: F401
 
-from lerobot_constructskill.contract import ACTION_SCALE, GRIPPER_OPEN, OBS_TYPES, REWARD_PLACED, get_task
+from lerobot_constructskill.contract import (
+    ACTION_SCALE,
+    ACTIONS,
+    FULL_ACTION,
+    GRIPPER_OPEN,
+    OBS_TYPES,
+    REWARD_PLACED,
+    get_task,
+)
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.sim.actions import LEAST, Clipping
 
 pytest.importorskip("vla_eval", reason="extra `evaluators`")
 
 from vla_eval.config import EvalConfig
+from vla_eval.orchestrator import Connection, Orchestrator
 from vla_eval.registry import resolve_import_string
 from vla_eval.render import apply_render_mode
 from vla_eval.runners.sync_runner import SyncEpisodeRunner
@@ -96,16 +106,17 @@ def test_the_expert_succeeds_through_the_harness(benchmark_class, monkeypatch):
     assert result == teacher.result and 60 < result["steps"] < steps
     assert benchmark._last_result.reward == REWARD_PLACED and benchmark.render().ndim == 3
     assert benchmark._last_result.info["clipped_steps"] == 0
-    with pytest.raises(ValueError, match="4 finite numbers"):
+    with pytest.raises(InputError, match="sends 5 numbers"):
         benchmark.step({"actions": np.zeros(5)})
     benchmark.cleanup()
     assert benchmark.render() is None
 
 
 @pytest.mark.sim
-def test_a_model_that_sends_normalised_actions_is_told_so(benchmark_class, monkeypatch, caplog):
+@pytest.mark.parametrize("action", ACTIONS)
+def test_a_model_that_sends_normalised_actions_is_told_so(action, benchmark_class, monkeypatch, caplog):
     monkeypatch.setattr(Clipping, "has_warned", False)
-    benchmark = benchmark_class(tasks="brick_to_bin")
+    benchmark = benchmark_class(tasks="brick_to_bin", action=action)
     (task,) = benchmark.get_tasks()
     asyncio.run(benchmark.start_episode(task))
     steps = [benchmark.step({"actions": [0.6, -0.4, 0.9, 0, 0, 0, 1]}) for _ in range(LEAST)]
@@ -177,6 +188,48 @@ def test_holding_keeps_the_gripper_and_moves_nothing(benchmark_class):
     assert benchmark.get_hold_action({"actions": np.array([0.1, 0, 0, -1])})["actions"].tolist() == [0, 0, 0, -1]
 
 
+TAKEN = {
+    4: {"tasks": "brick_to_bin"},
+    5: {"tasks": "brick_to_bin_turned"},
+    7: {"tasks": "bins,brick_to_bin_turned", "action": "full"},
+}
+"""Length of an action to what asks for it."""
+
+
+@pytest.mark.parametrize("sent", TAKEN)
+@pytest.mark.parametrize("asked", TAKEN)
+def test_tasks_take_their_own_numbers_or_seven(asked, sent, benchmark_class, monkeypatch, tmp_path, caplog):
+    """The harness's own start of a run, with no episode in it."""
+    told = {name: spec.to_dict() for name, spec in benchmark_class(**TAKEN[sent]).get_action_spec().items()}
+
+    async def connect(self, **_):
+        self.server_info = {"action_spec": told, "observation_params": {"action_length": sent}}
+
+    monkeypatch.setattr(Connection, "connect", connect)
+    entry = {"benchmark": ENTRIES[0]["benchmark"], "params": TAKEN[asked], "episodes_per_task": 0}
+    run = Orchestrator({"benchmarks": [entry], "output_dir": str(tmp_path)}, no_save=True).run()
+    if sent not in (asked, 7):
+        own = "" if asked == 7 else rf"{asked} \(.* or "
+        with pytest.raises(InputError, match=rf"sends {sent} numbers a step, .* take {own}7 \(.*`action: full`"):
+            asyncio.run(run)
+        return
+    with caplog.at_level("INFO"):
+        asyncio.run(run)
+    assert "Spec validation passed" in caplog.text and "cannot be forwarded" not in caplog.text
+    benchmark = benchmark_class(**TAKEN[asked])
+    names = get_task(benchmark.get_tasks()[-1]["name"], TAKEN[asked].get("action", "task")).action_names
+    assert sum(part.dims for part in benchmark.get_action_spec().values()) == len(names) == asked
+    last = {"actions": np.arange(sent)}
+    assert benchmark.get_hold_action(last)["actions"].tolist() == [0] * (asked - 1) + [sent - 1]
+    places = [FULL_ACTION.index(name) for name in names] if sent == 7 else range(sent)
+    assert benchmark._command(last["actions"]).tolist() == [*places]
+
+
+def test_an_action_is_one_of_two(benchmark_class):
+    with pytest.raises(InputError, match="action must be one of task, full, not 'half'"):
+        benchmark_class(action="half")
+
+
 @pytest.fixture(params=["base"])
 def untrained(request, config, tmp_path) -> Path:  # noqa: F811
     """A checkpoint of frozen_vit as LeRobot keeps one, its heads random, which looks through one camera."""
@@ -217,6 +270,7 @@ def test_the_model_server_says_what_its_checkpoint_was_trained_to_send(untrained
     asked, seen = benchmark.get_action_spec(), benchmark.get_observation_spec()
     found = check_specs(server.get_action_spec(), asked, server.get_observation_spec(), seen)
     assert [line.split("]")[0] for line in found] == [f"action [{field}" for field in told]
+    assert server.get_observation_params()["action_length"] == 4
 
 
 def wait_for(address: str, server: subprocess.Popen) -> None:

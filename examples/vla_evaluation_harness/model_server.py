@@ -5,11 +5,13 @@
 
 The server is the harness's own; this lets LeRobot find its plugins first, gives a policy the cameras that it was
 trained on, and says what the checkpoint sends and reads: the harness compares that with the benchmark's specification
-before the first episode and warns of every field that differs. `use_select_action` asks the policy at every step,
-which temporal ensembling needs; without it the harness executes the checkpoint's `n_action_steps` of each chunk.
+before the first episode and warns of every field that differs. The benchmark refuses a checkpoint whose actions are
+too long or too short for it. `use_select_action` asks the policy at every step, which temporal ensembling needs;
+without it the harness executes the checkpoint's `n_action_steps` of each chunk.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import constructskill_specs as specs
 from vla_eval.model_servers.lerobot import LeRobotModelServer
@@ -29,6 +31,11 @@ class ModelServer(LeRobotModelServer):
         if self._image_keys_arg or not named.keys() <= images.keys():
             return super()._resolve_image_map(images)
         return named
+
+    def get_observation_params(self) -> dict[str, Any]:
+        """The harness's, and how many numbers the checkpoint sends: the harness only warns where they do not fit."""
+        (count,) = self._policy.config.output_features["action"].shape
+        return super().get_observation_params() | {"action_length": count}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """The numbers that the checkpoint sends, and whether its training data had them in metres or from -1 to 1."""
