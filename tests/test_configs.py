@@ -19,7 +19,7 @@ from metadata import write_metadata
 import lerobot_constructskill.plugin  # noqa: F401
 from lerobot_constructskill import presets
 from lerobot_constructskill.board.protocol import BOARD_SUITES, PERTURBED_AXES
-from lerobot_constructskill.contract import CAMERAS, FPS, TASKS, get_task, held_out
+from lerobot_constructskill.contract import ANY_ACTION, CAMERAS, FPS, TASK_ACTION, TASKS, get_task, held_out
 from lerobot_constructskill.demos.columns import demonstration_features
 from lerobot_constructskill.demos.recorder import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError, TakenError
@@ -131,8 +131,19 @@ def test_nothing_was_chosen_on_draws_starts_or_seeds_that_are_reported():
     reported = seeds_of(runs.pop("draws"))
     for name, others in runs.items():
         assert not reported & seeds_of(others), name
-    chosen_with = {run.seed for run in runs["draws_choice"]}
-    assert min(chosen_with) >= 200, "training seeds from 0 on are reported"
+
+
+@pytest.mark.parametrize("choice", [path.stem for path in STUDIES if path.stem.endswith("_choice")])
+def test_a_choice_is_made_on_other_starts_and_training_seeds_than_its_study_reports(choice):
+    """Their demonstrations may be the same: a page that reports the study says so."""
+    chosen, reported = (
+        list_runs(parse(StudyConfig, [], CONFIGS / "study" / f"{name}.yaml").study)
+        for name in (choice, choice.removesuffix("_choice"))
+    )
+    starts = [set(chain(*(run.arm.starts for run in runs))) for runs in (chosen, reported)]
+    assert not starts[0] & seeds_of(reported) and not starts[1] & seeds_of(chosen)
+    trained_with = [{run.seed for run in runs if run.arm.role == VARIANT} for runs in (chosen, reported)]
+    assert not trained_with[0] & trained_with[1]
 
 
 def test_the_papers_study_holds_its_52_runs():
@@ -363,13 +374,14 @@ def published(kind: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", ["act", "diffusion", *PUBLISHED])
-def test_other_policies_accept_our_features_under_the_names_they_know(kind, written, train_config, tmp_path):
+@pytest.mark.parametrize("name", ["act", "diffusion", *PUBLISHED, "smolvla_suite", "pi05_suite"])
+def test_other_policies_accept_our_features_under_the_names_they_know(name, written, train_config, tmp_path):
     """As far as pi0 and pi0.5 are tested here: their 3 billion parameters are never built."""
+    kind = name.removesuffix("_suite")
     base = [f"--policy.path={published(kind, tmp_path)}"] if kind in PUBLISHED else []
-    config = train_config(written(kind), f"--output_dir={tmp_path / 'out'}", *base)
+    config = train_config(written(name), f"--output_dir={tmp_path / 'out'}", *base)
     config.validate()
-    policy, task = config.policy, get_task("brick_to_bin")
+    policy, task = config.policy, get_task("brick_to_bin", TASK_ACTION if name == kind else ANY_ACTION)
     columns = demonstration_features(task, ["base", "wrist"])
     features = dataset_to_policy_features(columns)
     policy.output_features = {"action": features.pop("action")}
@@ -378,6 +390,7 @@ def test_other_policies_accept_our_features_under_the_names_they_know(kind, writ
     renamed = {config.rename_map.get(name, name) for name in features}
     assert renamed <= policy.input_features.keys() and len(renamed) == len(CAMERAS) + 1
     assert policy.type == kind and not policy.push_to_hub
+    assert policy.action_feature.shape == ((4,) if name == kind else (7,))
     seconds = policy.n_action_steps / FPS
     assert 0.3 <= seconds <= 0.5 and max(policy.action_delta_indices) < 60
 
