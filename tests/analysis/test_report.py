@@ -29,10 +29,11 @@ from synthetic_study import (
 
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.analysis.report.figures import seeds_figure
-from lerobot_constructskill.analysis.report.formats import p_value, signed
+from lerobot_constructskill.analysis.report.formats import p_value, signed, times
 from lerobot_constructskill.analysis.report.page import read_study
 from lerobot_constructskill.analysis.report.summarize import summarize
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
+from lerobot_constructskill.analysis.stats.power import detectable_spread_ratio
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.study.rows import Draws
@@ -147,6 +148,16 @@ def test_report_says_what_is_missing_and_what_failed(study):
     assert "1 of 92 runs are missing" in markdown
     (row,) = [line for line in markdown.splitlines() if line.startswith("| clip: CLIP ViT-B/16 (1 failed run) |")]
     assert "/9" in row
+
+
+@pytest.mark.slow
+def test_report_says_which_spread_so_many_seeds_find(study):
+    """Of ten seeds each, and of three against ten."""
+    markdown = (study / "report.md").read_text()
+    spreads = markdown.split("### The same comparisons of the spread over seeds")[1].split("\n\n")[1].splitlines()
+    found = {line.split("|")[1].strip(): line.split("|")[-2].strip() for line in spreads}
+    expected = {times(detectable_spread_ratio(10, seeds)) for seeds in (3, 10)}
+    assert len(expected) == 2 and {*found.values()} >= expected, found
 
 
 def test_a_run_that_was_not_made_is_neither_a_failure_nor_a_zero(tmp_path):

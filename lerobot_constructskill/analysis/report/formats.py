@@ -1,5 +1,7 @@
 """Numbers as a report prints them. Every function returns plain text."""
 
+from math import inf
+
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 
 
@@ -43,6 +45,11 @@ def deviation(estimate: Estimate) -> str:
 def in_points(share: float | None) -> str:
     """A share in points: 0.061 -> "6.1"; "–" for None."""
     return "–" if share is None else f"{100 * share:.1f}"
+
+
+def times(ratio: float) -> str:
+    """How many times as large: 2.5 -> "2.5 times"; "none" for infinity."""
+    return "none" if ratio == inf else f"{ratio:g} times"
 
 
 def p_value(p: float) -> str:

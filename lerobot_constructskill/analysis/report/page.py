@@ -16,7 +16,7 @@ from lerobot_constructskill.analysis.report import figures, formats
 from lerobot_constructskill.analysis.report.findings import SettingFindings
 from lerobot_constructskill.analysis.report.summarize import summarize
 from lerobot_constructskill.analysis.section import Analysis
-from lerobot_constructskill.analysis.stats.power import MOST, seeds_needed, wrong_order
+from lerobot_constructskill.analysis.stats.power import MOST, detectable_spread_ratio, seeds_needed, wrong_order
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.files import Yaml, read_text
@@ -169,7 +169,8 @@ def _environment(finalize) -> Environment:
         finalize=finalize,
     )
     environment.filters |= {name: word for name, word in vars(formats).items() if callable(word)} | {"plural": plural}
-    environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed, "most": MOST}
+    functions = {function.__name__: function for function in (wrong_order, seeds_needed, detectable_spread_ratio)}
+    environment.globals |= functions | {"most": MOST}
     return environment
 
 
