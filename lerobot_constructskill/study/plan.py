@@ -123,7 +123,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     with _inside(f"variants.{name}.policy"):
         learner = Learner.of(variant.policy)
         check_inputs(learner.config, common["env"]["obs_type"], data.node.config.seen)
-        _check_told(learner, data, common["env"])
+        _check_told(learner, data, common)
     starts = {"demonstrations": data.node.starts, "evaluation": common["starts"]}
     rounds = _rounds(study, name, variant, data) if variant.dagger else None
     training = _training_of(study, common["setting"], name, variant)
@@ -136,7 +136,7 @@ def _variant_arm(study: Study, name: str, variant: Variant, data: NamedSet, comm
     )
 
 
-def _check_told(learner: Learner, data: NamedSet, env: Mapping[str, Any]) -> None:
+def _check_told(learner: Learner, data: NamedSet, common: Mapping[str, Any]) -> None:
     """Refuse an instruction that a policy which is told one will not know: that of no task that it learns from.
 
     A sentence encoder also takes other wordings of these tasks; told by number, a policy knows the trained ones alone.
@@ -144,12 +144,14 @@ def _check_told(learner: Learner, data: NamedSet, env: Mapping[str, Any]) -> Non
     language = getattr(learner.config, "language", None)
     if language is None:
         return
-    tasks, levels = data.node.config.rows, 1 if language == "number" else None
+    env, tasks, levels = common["env"], data.node.config.rows, 1 if language == "number" else None
     known = {word for task in tasks for word in (task.instruction, *chain(*task.rewordings[:levels]))}
-    asked = perturbed_task(env["task"], env["perturb"], env["perturb_seed"])[0].instruction
-    if asked not in known:
-        trained = "; ".join(dict.fromkeys(task.instruction for task in tasks))
-        raise InputError(f"It is told '{asked}', on which nothing is trained; '{data.name}' is asked: {trained}")
+    task, perturbation = perturbed_task(env["task"], env["perturb"], env["perturb_seed"])
+    if (asked := perturbation.told(task).instruction) not in known:
+        raise InputError(
+            f"In settings.{common['setting']} it is told '{asked}', which it cannot learn from '{data.name}': train "
+            "on the task that is asked so, or evaluate another."
+        )
 
 
 def _rounds(study: Study, name: str, variant: Variant, data: NamedSet) -> DaggerConfig:

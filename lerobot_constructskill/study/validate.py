@@ -17,14 +17,14 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
     """Measure the held-out errors that are not known yet; those that cannot be measured are logged and stay unknown.
 
     Args:
-        runs: those whose policies are validated, where the store has them.
+        runs: those whose policies are validated, where the store has them. Nothing is made for one trained elsewhere.
         others: the other runs of their study, which are not asked for.
         times: folder of the file that says what took how long.
     """
-    kept = [run for run in runs if run.checkpoints and store.has(run.checkpoints)]
-    pairs = list_pairs(kept, [*others, *(run for run in runs if run not in kept)])
+    elsewhere = [run for run in runs if run.checkpoints and not _has_any(store, run)]
+    pairs = list_pairs([run for run in runs if run not in elsewhere], [*others, *elsewhere])
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
-        nodes = [heldout(run, data) for run in kept if run.arm is arm]
+        nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
         due = [node for node in nodes if not store.has(node)]
         if not due:
             continue
@@ -34,6 +34,11 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
             logger.warning("%s is not validated on %s: %s", arm.id, data.name, said)
         for node, failure in failed.items():
             store.note(node, failure)
+
+
+def _has_any(store: Store, run: Run) -> bool:
+    """Whether the store has a run's policy or what it learns from: else it was trained elsewhere."""
+    return any(map(store.has, (run.checkpoints, run.arm.demonstrations.node)))
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, NamedSet]]:

@@ -150,15 +150,17 @@ def test_demonstrations_and_environment_have_one_action():
         ("minilm", "suite/orders", {"task": "brick_to_grey", "perturb": "wrong_task=1"}, None),
         ("minilm", "suite/orders", {"task": "brick_on_brick"}, get_task("brick_on_brick").instruction),
         ("minilm", "suite/orders --task=block_to_grey", {"task": "brick_to_grey"}, "brick"),
-        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "language=1"}, None),
-        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "language=3"}, "It is told"),
+        ("minilm", "suite/orders --task=brick_to_grey", {"task": "brick_to_grey", "perturb": "wrong_task=1"}, "brick"),
+        ("number", "suite/orders", {"task": "brick_to_grey"}, None),
+        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "wrong_task=1"}, None),
+        ("number", "suite/orders", {"task": "brick_to_grey", "perturb": "language=1"}, "it is told"),
         (None, "suite/orders", {"task": "brick_on_brick"}, None),
     ],
 )
 def test_an_instruction_that_nothing_was_trained_on_is_refused_before_anything_is_made(language, data, env, refused):
     told = {"policy": {"type": "frozen_vit", "backbone": "dinov2_vits14", "language": language}, "seeds": 1}
     many = study(settings={"one": Setting(data, ENV | env)}, variants={"told": Variant(**told)}, references={})
-    said = rf"variants\.told\.policy: .*{refused}.* nothing is trained; '{data}'"
+    said = rf"variants\.told\.policy: In settings\.one .*{refused}.* cannot learn from '{data}'"
     with pytest.raises(InputError, match=said) if refused else nullcontext():
         list_runs(many)
 

@@ -77,15 +77,21 @@ def seeds_needed_for_mean(difference: float, deviation: float, alpha: float = 0.
     return next(enough, inf)
 
 
-@cache
 def detectable_spread_ratio(seeds_a: int, seeds_b: int, alpha: float = 0.05) -> float:
     """The smallest of `RATIOS` of two standard deviations over seeds that is found with 80 % power, else infinity.
 
     Simulated for seeds that vary normally about one mean, with the permutation test of `comparisons.spread_p_value`.
+    Where one side has more seeds, the ratio is found whichever side varies more.
 
     Args:
         seeds_a, seeds_b: two or more each.
     """
+    return max(_wider_first(seeds_a, seeds_b, alpha), _wider_first(seeds_b, seeds_a, alpha))
+
+
+@cache
+def _wider_first(seeds_a: int, seeds_b: int, alpha: float) -> float:
+    """`detectable_spread_ratio` where the first seeds vary more."""
     rng = np.random.default_rng(0)
     seeds = rng.standard_normal((SIMULATED, seeds_a + seeds_b))
     orders = rng.permuted(np.tile(np.arange(seeds_a + seeds_b), (SHUFFLED, 1)), axis=1)
