@@ -21,7 +21,7 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
         others: the other runs of their study, which are not asked for.
         times: folder of the file that says what took how long.
     """
-    elsewhere = [run for run in runs if run.checkpoints and not _has_any(store, run)]
+    elsewhere = [run for run in runs if _was_trained_elsewhere(run, store)]
     pairs = list_pairs([run for run in runs if run not in elsewhere], [*others, *elsewhere])
     for arm, data in Progress(pairs, "validation", unit="set", disable=not pairs):
         nodes = [heldout(run, data) for run in runs if run.arm is arm and store.has(run.checkpoints)]
@@ -36,9 +36,10 @@ def validate(runs: Sequence[Run], others: Sequence[Run], store: Store, machine: 
             store.note(node, failure)
 
 
-def _has_any(store: Store, run: Run) -> bool:
-    """Whether the store has a run's policy or what it learns from: else it was trained elsewhere."""
-    return any(map(store.has, (run.checkpoints, run.arm.demonstrations.node)))
+def _was_trained_elsewhere(run: Run, store: Store) -> bool:
+    """Whether the store has neither a run's policy nor what it learns from."""
+    policy, data = run.checkpoints, run.arm.demonstrations
+    return policy is not None and data is not None and not (store.has(policy) or store.has(data.node))
 
 
 def list_pairs(runs: Sequence[Run], others: Sequence[Run]) -> list[tuple[Arm, NamedSet]]:
