@@ -1,9 +1,9 @@
 """Every axis does what it says and nothing else, the same every time, and leaves the task alone at level 0."""
 
-import re
 import sys
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,7 @@ import pytest
 import torch
 
 from lerobot_constructskill.board.protocol import BoardSetting
-from lerobot_constructskill.contract import TASKS, get_task
-from lerobot_constructskill.demos.demonstrate import demonstrate
-from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
-from lerobot_constructskill.demos.noise import NoiseConfig
+from lerobot_constructskill.contract import SUITES, TASKS, get_task
 from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError, UserError
@@ -22,10 +19,35 @@ from lerobot_constructskill.perturbations import AXES, BODIES, Perturbation
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
-from axes import Difference, complaints, replay  # noqa: E402
+from axes import (  # noqa: E402
+    GRASPED,
+    PAGE,
+    Difference,
+    cells,
+    complaints,
+    grasping,
+    levels,
+    replay,
+    seed_of,
+    sentences,
+)
 
-TASK = get_task("brick_to_bin")
-LEVELS = [(axis, level) for axis, of in AXES.items() for level in range(1, len(of.levels) + 1)]
+TASK = "brick_to_bin"
+OTHERS = [names[-1] for names in SUITES.values() if TASK not in names]
+CHANGED, SAID = PAGE.read_text(encoding="utf-8").split("\n\nHow many")
+TOLD = {row.split("`")[1]: row for row in SAID.splitlines() if row.startswith("| `")}
+"""The page's row of each task that it covers."""
+
+
+def highest(axis):
+    return len(AXES[axis].levels)
+
+
+def row_of(task, axis, level):
+    """The page's only row of this level that covers the task."""
+    rows = [row for row in CHANGED.splitlines() if row.startswith(f"| `{axis}` | {level} |")]
+    (row,) = (row for row in rows if row.endswith("| all |") or f"`{task}`" in row.rsplit("|", 2)[1])
+    return row
 
 
 def start(seed=0, **kwargs):
@@ -42,30 +64,59 @@ def nominal():
     return start()
 
 
-@pytest.fixture(scope="module")
-def grasped():
-    """The expert's actions until it has the brick in the jaws, and the episode."""
-    env, expert = ConstructSkillEnv("brick_to_bin", render_backend="none"), make_expert(TASK, ExpertConfig())
-    frames, _ = demonstrate(env, expert, NoiseConfig(sigma=0.0), 0)
-    env.close()
-    actions = [frame["action"] for frame in frames if frame["phase"] in ("PREGRASP", "DESCEND", "GRASP")]
-    return actions, replay(actions, task=TASK.name)
+@lru_cache(1)
+def usual(task, steps=GRASPED):
+    """The expert's actions until it has the object in the jaws, at most so many, and the episode."""
+    actions = grasping(task, steps)
+    return actions, replay(actions, task)
+
+
+def certified(task, axis, level, steps=GRASPED):
+    """What a level changes: what is said and nothing else. Were it anything else, it would be found."""
+    actions, nominal = usual(task, steps)
+    seen = Difference.between(nominal, replay(actions, task, f"{axis}={level}", seed_of(task, axis, level)))
+    assert list(complaints(axis, seen)) == []
+    leaks = replace(seen, said="" if seen.said else "another"), replace(seen, at_start={*BODIES}, later={*BODIES})
+    assert all([*complaints(axis, leak)] for leak in leaks)
+    return seen
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize("axis", AXES)
-def test_an_axis_changes_what_it_says_and_nothing_else(axis, grasped):
-    """Of every level, and beyond the grasp: `python benchmarks/axes.py`."""
-    actions, nominal = grasped
-    seen = Difference.between(nominal, replay(actions, f"{axis}={len(AXES[axis].levels)}", TASK.name))
-    assert list(complaints(axis, seen)) == []
-    leaks = replace(seen, instruction=not seen.instruction), replace(seen, at_start={*BODIES}, later={*BODIES})
-    assert all([*complaints(axis, leak)] for leak in leaks)
+@pytest.mark.parametrize(
+    ("task", "axis", "level"),
+    [
+        pytest.param(task, axis, level, marks=[pytest.mark.nightly] * (task != TASK or level < highest(axis)))
+        for task in TASKS
+        for axis, level in levels(task)
+    ],
+)
+def test_an_axis_changes_what_it_says_and_nothing_else_and_the_page_says_the_same(task, axis, level):
+    seen = certified(task, axis, level)
+    if task in TOLD:
+        assert row_of(task, axis, level).startswith(cells(axis, level, seen)) and seen.said in TOLD[task]
+        assert TOLD[task].startswith(f"| `{task}` | {len(usual(task)[0])} |")
 
 
-def test_the_page_of_what_axes_change_has_every_level():
-    page = (BENCHMARKS / "AXES.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `(\w+)` \| (\d) \|", page, re.MULTILINE) == [(axis, str(level)) for axis, level in LEVELS]
+@pytest.mark.sim
+@pytest.mark.parametrize(
+    ("task", "axis"), [(task, axis) for task in OTHERS for axis, level in levels(task) if level == highest(axis)]
+)
+def test_so_it_does_in_the_first_steps_of_a_task_of_every_other_suite(task, axis):
+    certified(task, axis, highest(axis), steps=6)
+
+
+@pytest.mark.parametrize("task", TOLD)
+def test_the_page_of_what_axes_change_has_every_level_once_and_every_sentence(task):
+    for axis, level in levels(task):
+        row, changes = row_of(task, axis, level), AXES[axis].changes
+        said = "another" if "instruction" in changes else ""
+        equal = cells(axis, level, Difference(set(), set(), {}, {}, said))
+        moves = {"execution", *BODIES} & {*changes}
+        assert row.startswith(equal.rsplit("equal | equal", 1)[0] if moves else equal)
+    changing = [one for one in levels(task) if "instruction" in AXES[one[0]].changes]
+    said = [Perturbation(f"{axis}={level}").told(get_task(task)).instruction for axis, level in changing]
+    actions = TOLD[task].split(" | ")[1]
+    assert TOLD[task].startswith(sentences(task, actions, get_task(task).instruction, said))
 
 
 @pytest.mark.sim
