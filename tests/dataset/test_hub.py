@@ -11,8 +11,10 @@ from types import SimpleNamespace
 
 import pytest
 from hub_server import TOKENS, serve
+from toy import record_toy
 
 from lerobot_constructskill.contract import SUITES
+from lerobot_constructskill.dataset.dataset import open_dataset
 from lerobot_constructskill.dataset.hub import locate, push
 from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.errors import InputError, TakenError
@@ -109,6 +111,14 @@ def test_what_is_pushed_is_pulled_by_revision_and_from_a_warm_cache(hub, machine
         assert "# alice/toy" in (pulled / "README.md").read_text() and (pulled / "pictures").is_dir()
     assert machine(count_frames, "alice/toy", "v3.0") == 1108
     assert all(TOKEN.encode() not in content for content in hub.blobs.values())
+
+
+def test_a_set_of_several_tasks_is_pulled_as_it_was_pushed(hub, machine, tmp_path):
+    record_toy(tmp_path / "set", 1, task="brick_to_bin,block_to_bin", action="full", annotate=True)
+    machine(push, tmp_path / "set", "alice/both")
+    pulled = machine(locate, "alice/both")
+    assert file_hashes(pulled) == file_hashes(tmp_path / "set")
+    assert open_dataset(pulled).task_names == ["brick_to_bin", "block_to_bin"]
 
 
 def test_a_push_that_was_cut_continues_with_what_arrived(hub, machine, pristine):
