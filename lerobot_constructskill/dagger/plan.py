@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 from lerobot_constructskill.contract import TASK_ACTION
@@ -30,7 +31,7 @@ class Plan:
         seed: the training seed.
 
     Raises:
-        InputError: the base has several tasks or labels that are not the expert's, or a start would be used twice.
+        InputError: the base has labels that are not the expert's or annotated walls, or a start would be used twice.
     """
 
     config: DaggerConfig
@@ -40,10 +41,12 @@ class Plan:
     seed: int
 
     def __post_init__(self):
-        if len(self.base.config.rows) > 1:
-            raise InputError(f"DAgger's rounds are of one task; the base has several, {self.base.config.task}.")
-        if self.base.config.annotate:
-            raise InputError("The base has language columns, which rounds have not: generate it without annotate.")
+        walls = [row.name for row in self.base.config.rows if row.plan is not None]
+        if self.base.config.annotate and walls:
+            raise InputError(
+                f"Language columns would not be exact in rounds of {walls[0]}, where a policy may go back to an "
+                "element within a phase: generate the base without annotate."
+            )
         if self.base.config.labels == "executed":
             raise InputError("The base has executed actions as labels; DAgger needs the expert's.")
         check_apart({"demonstrations": self.base.starts, "rounds": self.config.starts})
@@ -59,17 +62,18 @@ class Plan:
         return cls(config, Demonstrations(base), Learner.of(config.policy), config.training, config.seed)
 
     @cached_property
-    def env(self) -> dict[str, Any]:
-        """Keywords of `ConstructSkillEnv` in every round, with what they leave to the machine written out.
+    def envs(self) -> list[dict[str, Any]]:
+        """Keywords of `ConstructSkillEnv` for each task in every round, with all that is left to the machine.
 
         Raises:
             InputError: the policy reads what the base does not show.
         """
-        base, (task,) = self.base.config, self.base.config.rows
+        base = self.base.config
         check_inputs(self.learner.config, base.obs_type, base.seen)
         light_robot, backend = resolve_rendering(base.light_robot)
+        shown = {"cameras": base.seen} if base.cameras else {}
         acting = {} if base.action == TASK_ACTION else {"action": base.action}
-        return (
+        return [
             {
                 "task": task.name,
                 "obs_type": base.obs_type,
@@ -77,9 +81,10 @@ class Plan:
                 "light_robot": light_robot,
                 "render_backend": backend,
             }
-            | ({"cameras": base.seen} if base.cameras else {})
+            | shown
             | acting
-        )
+            for task in base.rows
+        ]
 
     def data(self, number: int) -> Demonstrations | MergedSet:
         """What policy `number` is trained on: the demonstrations and the first `number` rounds."""
@@ -89,17 +94,18 @@ class Plan:
         """Policy `number`."""
         return self._chain[1][number]
 
-    def round(self, number: int) -> Round:
-        """The frames of a round, counted from 1, in which policy `number - 1` drives."""
+    def round(self, number: int) -> tuple[Round, ...]:
+        """The frames of a round, counted from 1, of each task, in which policy `number - 1` drives."""
         return self._chain[2][number - 1]
 
     @cached_property
-    def _chain(self) -> tuple[list[Demonstrations | MergedSet], list[Checkpoints], list[Round]]:
+    def _chain(self) -> tuple[list[Demonstrations | MergedSet], list[Checkpoints], list[tuple[Round, ...]]]:
         """Data sets, policies and rounds in order."""
-        data, policies, rounds = [self.base], [self._trained_on(self.base)], []
+        data: list[Demonstrations | MergedSet] = [self.base]
+        policies, rounds = [self._trained_on(self.base)], []
         for number in range(1, self.config.rounds + 1):
             rounds.append(self._driven_by(policies[-1], number))
-            data.append(MergedSet(self.base, tuple(rounds)))
+            data.append(MergedSet(self.base, tuple(chain(*rounds))))
             policies.append(self._trained_on(data[-1]))
             assert policies[-1].digest  # now, where few calls are nested: a hundred rounds would be too many
         return data, policies, rounds
@@ -107,11 +113,11 @@ class Plan:
     def _trained_on(self, data: Demonstrations | MergedSet) -> Checkpoints:
         return Checkpoints.holding(self.seed, self.learner, self.training, data, alone=True)
 
-    def _driven_by(self, policy: Checkpoints, number: int) -> Round:
-        seeds, config = self.seeds(number), self.config
-        return Round(policy, self.base, self.env, seeds, number, config.beta(number), config.patience)
+    def _driven_by(self, policy: Checkpoints, number: int) -> tuple[Round, ...]:
+        how = self.seeds(number), number, self.config.beta(number), self.config.patience
+        return tuple(Round(policy, self.base, env, *how) for env in self.envs)
 
     def seeds(self, number: int) -> range:
-        """Seeds of the episodes of a round."""
+        """Seeds of the episodes of a round, in every task."""
         first = (number - 1) * self.config.episodes
         return self.config.starts[first : first + self.config.episodes]

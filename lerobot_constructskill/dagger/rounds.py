@@ -1,4 +1,4 @@
-"""A round of DAgger as a node of a store: the episodes that a policy drives, as a LeRobotDataset."""
+"""A round of DAgger in one task as a node of a store: the episodes that a policy drives, as a LeRobotDataset."""
 
 import json
 import tempfile
@@ -13,10 +13,11 @@ from lerobot_constructskill.artifacts.digests import file_sha256, versions
 from lerobot_constructskill.artifacts.disk import room_for
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Machine, Node
+from lerobot_constructskill.contract import Task, get_task
 from lerobot_constructskill.dagger.driving import Drive, RunningEpisode, drive_all
 from lerobot_constructskill.demos.columns import EXPERT, dagger_features
 from lerobot_constructskill.demos.expert import make_expert
-from lerobot_constructskill.demos.merge import aggregate
+from lerobot_constructskill.demos.merge import aggregate, name_tasks
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.shards import EPISODE, whole, write_episode
 from lerobot_constructskill.errors import InputError
@@ -72,12 +73,12 @@ ONE, DRIVEN = Json("a driven episode", DrivenEpisode), Json("a round's episodes"
 
 @dataclass(frozen=True, eq=False)
 class Round(Node):
-    """Episodes in which a policy drives and the expert labels every frame; a LeRobotDataset.
+    """Episodes of one task in which a policy drives and the expert labels every frame; a LeRobotDataset.
 
     Args:
         policy: one checkpoint.
-        base: the demonstrations, for their task, their expert and their video encoding.
-        env: keywords of `ConstructSkillEnv`.
+        base: the demonstrations, for their action, their expert and their video encoding.
+        env: keywords of `ConstructSkillEnv`, the task among them.
         seeds: seeds of the initial states.
         number: the round's number, counted from 1.
         beta: probability that a step executes the expert's action.
@@ -95,14 +96,23 @@ class Round(Node):
     kind = "rounds"
     keeps = SHARDS
 
+    @property
+    def task(self) -> Task:
+        """The task, whose action is that of the base."""
+        return get_task(self.env["task"], self.base.config.action)
+
+    @property
+    def is_of_several(self) -> bool:
+        """Whether the base has other tasks too, each with rounds of its own."""
+        return len(self.base.config.rows) > 1
+
     def facts(self) -> dict[str, Any]:
         base, seeds = self.base.config, [self.seeds.start, self.seeds.stop]
         how = {"number": self.number, "beta": self.beta, "patience": self.patience}
         return how | {"seeds": seeds, "environment": self.env, "expert": vars(base.expert), "video": base.video}
 
     def versions(self) -> dict[str, str]:
-        (task,) = self.base.config.rows
-        own = code_of(__name__, task.scene, task.expert)
+        own = code_of(__name__, self.task.scene, self.task.expert)
         return versions(*DRIVING) | own | self.policy.learner.versions()
 
     @cached_property
@@ -117,7 +127,7 @@ class Round(Node):
             MachineError: the disk is full, this machine cannot render, or a simulator died.
         """
         shards, config = folder.with_name(SHARDS), self.base.config
-        (task,), repo_id = config.rows, self.repo_id
+        task, repo_id = self.task, self.repo_id
         checkpoint = checkpoint_of(self.policy.seeds.start, inputs["policy"])
         finished = {outcome.seed for outcome in whole(shards, OUTCOME, ONE.read)}
         for episode in self._drive(checkpoint, [seed for seed in self.seeds if seed not in finished], machine):
@@ -131,24 +141,26 @@ class Round(Node):
         outcomes = [ONE.read(shards / str(seed) / OUTCOME) for seed in self.seeds]
         roots = [shards / str(outcome.seed) / EPISODE for outcome in outcomes if outcome.frames]
         if not roots:
-            raise InputError(f"Round {self.number} has no frame in which the expert knew a way to success.")
+            of = f" of {task.name}" if self.is_of_several else ""
+            raise InputError(f"Round {self.number}{of} has no frame in which the expert knew a way to success.")
         with tempfile.TemporaryDirectory(dir=shards) as scratch, quiet(), room_for(folder):
             aggregate(repo_id, roots, folder, Path(scratch))
+        if self.is_of_several:
+            name_tasks(folder, [task.name] * len(roots))
         weights = checkpoint / "model.safetensors"
         driven = Driven(file_sha256(weights) if weights.exists() else None, outcomes)
         (folder / OUTCOMES).write_text(json.dumps(asdict(driven)) + "\n", encoding="utf-8")
 
     def _drive(self, checkpoint: Path, seeds: Sequence[int], machine: Machine) -> Iterator[RunningEpisode]:
         agent = PolicyAgent.from_pretrained(checkpoint, **self.policy.learner.acting)
-        (task,) = self.base.config.rows
-        expert = make_expert(task, self.base.config.expert)
+        expert = make_expert(self.task, self.base.config.expert)
         drive = Drive(self.number, self.beta, self.patience)
         yield from drive_all(agent, expert, self.env, seeds, drive, machine.together, machine.workers)
 
 
-def totals(folder: Path) -> dict[str, Any]:
-    """Sums over the episodes of a round, and the seeds of those without a frame."""
-    outcomes = DRIVEN.read(folder / OUTCOMES).episodes
+def totals(*folders: Path) -> dict[str, Any]:
+    """Sums over the episodes of a round, of one task or of several, and the seeds of those without a frame."""
+    outcomes = [outcome for folder in folders for outcome in DRIVEN.read(folder / OUTCOMES).episodes]
     return {
         "episodes": len(outcomes),
         "placed": sum(outcome.placed for outcome in outcomes),

@@ -3,7 +3,7 @@
 import json
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.dagger.merge import write_sidecar
 from lerobot_constructskill.dagger.plan import Plan
-from lerobot_constructskill.dagger.rounds import totals
+from lerobot_constructskill.dagger.rounds import Round, totals
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import MADE, SIDECAR
 from lerobot_constructskill.errors import plural
@@ -36,7 +36,8 @@ class Line:
         frames: of the data set that it was trained on, each with one expert's label.
         heldout_mse_m2: its error on that set's held-out episodes, in m2; None where it could not be measured, as of a
             policy whose chunks need more than single frames.
-        drove: `rounds.totals` of the round that it drove, None for the last policy.
+        drove: `rounds.totals` of the round that it drove, None for the last policy. With several tasks they are of all
+            together, and `tasks` has those of each.
     """
 
     policy: int
@@ -50,9 +51,11 @@ class Line:
             said.append(f"held-out error {self.heldout_mse_m2:.3g} m2")
         if self.drove:
             drove = self.drove
+            of_tasks = ", ".join(f"{name} {one['placed']}" for name, one in drove.get("tasks", {}).items())
             said.append(
-                f"drove round {self.policy + 1}: placed {drove['placed']} of {drove['episodes']}, "
-                f"{plural(drove['frames'], 'frame')}, {drove['by_expert']} of them by the expert's hand"
+                f"drove round {self.policy + 1}: placed {drove['placed']} of {drove['episodes']}"
+                f"{f' ({of_tasks})' if of_tasks else ''}, {plural(drove['frames'], 'frame')}, {drove['by_expert']} of "
+                "them by the expert's hand"
             )
         return "; ".join(said)
 
@@ -89,9 +92,16 @@ def _lines(plan: Plan, store: Store, machine: Machine) -> Iterator[Line]:
         for failure in store.get_all([error], machine).values():
             logger.warning("Policy %d is not validated: %s", number, failure.said)
         drives = number < plan.config.rounds
-        drove = totals(store.get(plan.round(number + 1), machine)) if drives else None
+        drove = _drive(plan.round(number + 1), store, machine) if drives else None
         frames = LeRobotDatasetMetadata(data.repo_id, root=store.get(data, machine)).total_frames
         yield Line(number, frames, known_error(error, store), drove)
+
+
+def _drive(rounds: Sequence[Round], store: Store, machine: Machine) -> dict[str, Any]:
+    """Drive a round in each task, and return its sums."""
+    folders = {one.task.name: store.get(one, machine) for one in rounds}
+    of_tasks = {"tasks": {name: totals(folder) for name, folder in folders.items()}} if len(folders) > 1 else {}
+    return totals(*folders.values()) | of_tasks
 
 
 def _copy_data(data: Path, repo_id: str, folder: Path) -> None:

@@ -29,11 +29,11 @@ class DaggerConfig:
         training: how the policy is trained; each time from the start.
         seed: training seed.
         rounds: how often the policy drives; with 0 it is behaviour cloning.
-        episodes: episodes a round.
-        max_steps: steps after which an episode ends without success; the task's horizon by default.
+        episodes: episodes a round, of each task.
+        max_steps: steps after which an episode ends without success; its task's horizon by default.
         betas: for each round the probability that a step executes the expert's action and not the policy's; the
             last one is also for the rounds that follow. The label is the expert's in every step.
-        seed_start: seed of the first episode; the seeds count up through all rounds.
+        seed_start: seed of the first episode; the seeds count up through all rounds, and are the same in every task.
         patience: number of steps in a row, in which the expert knows no way to success, after which an episode ends.
         workers: processes that simulate.
         together: episodes that run at the same time.
@@ -65,7 +65,7 @@ class DaggerConfig:
 
     @property
     def starts(self) -> range:
-        """Seeds of the episodes of all rounds."""
+        """Seeds of the episodes of all rounds, in every task."""
         return range(self.seed_start, self.seed_start + self.rounds * self.episodes)
 
     def beta(self, number: int) -> float:

@@ -5,7 +5,7 @@
 
 import json
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from typing import Any
 
 import numpy as np
@@ -265,9 +265,7 @@ def check_duplicates(data: DataSet) -> Iterator[str]:
 def check_hold_out(data: DataSet) -> Iterator[str]:
     """Holding out whole episodes separates seeds: none makes two episodes of a task, and none is an evaluation's."""
     found = data.column("sim.seed")[[span.start for span in data.spans()]]
-    counted = [
-        np.unique(found[block.episodes.start : block.episodes.stop], return_counts=True) for block in data.blocks
-    ]
+    counted = [np.unique(found[_there(block, found)], return_counts=True) for block in data.blocks]
     twice = np.unique(np.concatenate([seeds[counts > 1] for seeds, counts in counted]))
     low = np.unique(found[found < DEMO_SEED_START])
     yield from _found(
@@ -311,7 +309,8 @@ def check_provenance(data: DataSet) -> Iterator[str]:
 
 
 def _check_attempts(data: DataSet, block: TaskBlock) -> Iterator[str]:
-    starts = [span.start for span in data.spans()[block.episodes.start : block.episodes.stop]]
+    spans = data.spans()
+    starts = [spans[episode].start for episode in _there(block, spans)]
     seeds = data.column("sim.seed")[starts][data.rounds[starts] == 0].tolist()
     attempts = range(data.config.seed_start, data.config.seed_start + block.attempts)
     of = f" of {block.task.name}" if len(data.blocks) > 1 else ""
@@ -323,6 +322,11 @@ def _check_attempts(data: DataSet, block: TaskBlock) -> Iterator[str]:
             f"The episodes{of} are not in the order of their seeds.": seeds != sorted(seeds),
         }
     )
+
+
+def _there(block: TaskBlock, found: Sized) -> list[int]:
+    """The indices of a task's episodes that are among those found."""
+    return [episode for episode in block.episodes if episode < len(found)]
 
 
 def check_rounds(data: DataSet) -> Iterator[str]:
@@ -343,15 +347,19 @@ def check_rounds(data: DataSet) -> Iterator[str]:
             "Frames of a round in which the expert acted do not execute its action.": off.max(initial=0) > 1e-6,
         }
     )
+    episodes, place = np.unique(data.column("episode_index"), return_inverse=True)
+    of_task = np.array([data.task_of(episode).name for episode in episodes])[place]
     for entry in listed:
         number, first, rows = entry["round"], entry["seed_start"], data.rounds == entry["round"]
+        rows = rows & (of_task == entry.get("task", of_task))  # of several tasks, a round is listed for each
+        which = f"ound {number}" + (f" of {entry['task']}" if "task" in entry else "")
         counts, told = (int(rows.sum()), int(by_expert[rows].sum())), (entry["frames"], entry["by_expert"])
         seeds = sorted([*np.unique(data.column("sim.seed")[rows]).tolist(), *entry["discarded_seeds"]])
         yield from _found(
             {
-                f"Round {number} has {counts[0]} frames, {counts[1]} by the expert; its provenance says {told[0]} and "
+                f"R{which} has {counts[0]} frames, {counts[1]} by the expert; its provenance says {told[0]} and "
                 f"{told[1]}.": counts != told,
-                f"The seeds of round {number} and its discarded ones do not count up from {first}.": (
+                f"The seeds of r{which} and its discarded ones do not count up from {first}.": (
                     not _counts(seeds, range(first, first + entry["episodes"]))
                 ),
             }

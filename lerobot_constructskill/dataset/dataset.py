@@ -1,10 +1,9 @@
 """Reads a finished data set as plain tables from its files, without LeRobot, whose work the tables serve to check."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
 
@@ -102,13 +101,13 @@ class TaskBlock:
 
     Args:
         task: its row.
-        episodes: their indices.
+        episodes: their indices, in order; those of DAgger's rounds are not beside the demonstrations.
         attempts: how many were made.
         discarded_seeds: those of the attempts that failed.
     """
 
     task: Task
-    episodes: range
+    episodes: Sequence[int]
     attempts: int
     discarded_seeds: list[int]
 
@@ -177,24 +176,46 @@ class DataSet:
         Raises:
             InputError: the provenance does not say what was attempted of one of several tasks.
         """
-        rows, told, each = self.config.rows, self.facts, self.config.episodes
+        rows, told = self.config.rows, self.facts
         if len(rows) == 1:
             return [TaskBlock(rows[0], range(len(self.episodes)), told["attempts"], told["discarded_seeds"])]
         if [*told.get("tasks", {})] != [row.name for row in rows]:
             raise InputError(f"{SIDECAR} does not say in tasks what was attempted of each of {self.config.task}.")
         return [
-            TaskBlock(row, range(first, first + each), tried["attempts"], tried["discarded_seeds"])
-            for row, first, tried in zip(rows, count(0, each), told["tasks"].values(), strict=False)
+            TaskBlock(
+                row,
+                [episode for episode, name in enumerate(self.task_names) if name == row.name],
+                tried["attempts"],
+                tried["discarded_seeds"],
+            )
+            for row, tried in zip(rows, told["tasks"].values(), strict=True)
         ]
 
-    @property
+    @cached_property
     def task_names(self) -> list[str]:
-        """The name of each episode's task, as the provenance tells it."""
-        return [block.task.name for block in self.blocks for _ in block.episodes]
+        """The name of each episode's task, as the provenance tells it: of demonstrations, then of DAgger's rounds.
+
+        Raises:
+            InputError: the provenance does not say what was driven in which of several tasks.
+        """
+        if len(self.config.rows) == 1:
+            return [self.config.rows[0].name] * len(self.episodes)
+        names = [row.name for row in self.config.rows for _ in range(self.config.episodes)]
+        for driven in self.facts["dagger"]["rounds"] if "dagger" in self.facts else ():
+            match driven:
+                case {"task": str(name), "episodes": int(tried), "discarded_seeds": list(gone)}:
+                    # A file may say that there are more than fit in any memory.
+                    names += [name] * min(tried - len(gone), len(self.episodes))
+                case _:
+                    raise InputError(
+                        f"{SIDECAR} does not say in dagger what was driven in each of {self.config.task}."
+                    )
+        return names
 
     def task_of(self, episode: int) -> Task:
         """The row of an episode's task, the last one's for an episode more than there should be."""
-        return next((block.task for block in self.blocks if episode in block.episodes), self.blocks[-1].task)
+        tasks, names = {block.task.name: block.task for block in self.blocks}, self.task_names
+        return tasks.get(names[episode] if episode < len(names) else "", self.blocks[-1].task)
 
     @cached_property
     def columns(self) -> dict[str, dict[str, Any]]:

@@ -12,8 +12,10 @@ from lerobot.utils import DEFAULT_FEATURES
 from torch import Tensor
 
 from lerobot_constructskill.artifacts.digests import data_sha256, digest
+from lerobot_constructskill.artifacts.disk import disk_of
 from lerobot_constructskill.artifacts.folders import replaced
-from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.contract import IMAGE_SIZE
+from lerobot_constructskill.errors import InputError, MachineError
 from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.files import read_parquet
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
@@ -103,6 +105,7 @@ def write_feature_set(
 
     Raises:
         ValueError: the data set has no such camera, or does not say where things are.
+        MachineError: the disk could not hold the patches' features.
     """
     batch_size = batch_size or BATCHES.get(encoder.device.type, BATCH)
     info = info | _source(dataset) | batch_facts(encoder.device, batch_size)
@@ -113,11 +116,38 @@ def write_feature_set(
         name: folder.with_name(PARTS) / digest({**info, "camera": name, "patches": patches})
         for name in cameras_of(camera)
     }
-    made = [_encode_frames(dataset, name, encoder, batch_size, parts, patches) for name, parts in each.items()]
+    for name in each:
+        _check_camera(dataset, name)
+    size = _check_disk(dataset, encoder, [*each.values()], folder) if patches else 0
+    made = [_encode_frames(dataset, name, encoder, batch_size, parts, size) for name, parts in each.items()]
     columns = {feature_key(camera): np.concatenate(made, axis=1), **found}
     episodes = dataset.meta.episodes if patches else []
     files = [[_part(parts, episode).with_suffix(PATCHES) for parts in each.values()] for episode in episodes]
     _write_copy(dataset, camera, columns, files, info, repo_id, folder)
+
+
+def _check_camera(dataset: LeRobotDataset, camera: str) -> None:
+    if (key := f"observation.images.{camera}") not in dataset.meta.camera_keys:
+        cameras = ", ".join(dataset.meta.camera_keys) or "none"
+        raise InputError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
+
+
+def _check_disk(dataset: LeRobotDataset, encoder: FrozenEncoder, parts: Sequence[Path], folder: Path) -> int:
+    """Refuse a disk that could not hold every patch's feature twice, by episode and joined.
+
+    Returns:
+        Bytes that a camera's take, once.
+    """
+    _, tokens = encoder.encode(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE, device=encoder.device))
+    size = dataset.num_frames * tokens.half().nbytes
+    there = sum(file.stat().st_size for own in parts for file in own.glob(f"*{PATCHES}"))
+    disk, needed = disk_of(folder.parent), 2 * len(parts) * size - there
+    if (free := shutil.disk_usage(disk).free) < needed:
+        raise MachineError(
+            f"{disk} has {free / 1e6:,.0f} MB free, and the patch features of {dataset.num_frames:,} frames take "
+            f"{needed / 1e6:,.0f} MB more until they are put together: make room, or write to another disk."
+        )
+    return size
 
 
 def join_feature_sets(
@@ -169,24 +199,26 @@ def _source(dataset: LeRobotDataset) -> dict[str, str]:
 
 
 def _encode_frames(
-    dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int, parts: Path, patches: bool
+    dataset: LeRobotDataset, camera: str, encoder: FrozenEncoder, batch_size: int, parts: Path, size: int
 ) -> np.ndarray:
-    """Encode every frame of one camera to (N, D) float32, in the order of the data set, by way of `parts`."""
+    """Encode every frame of one camera to (N, D) float32, in the order of the data set, by way of `parts`.
+
+    Args:
+        size: bytes that the features of its patches take; 0 where these are not kept.
+    """
     key = f"observation.images.{camera}"
-    if key not in dataset.meta.camera_keys:
-        cameras = ", ".join(dataset.meta.camera_keys) or "none"
-        raise InputError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
     missing = [episode for episode in dataset.meta.episodes if not _part(parts, episode).exists()]
     finished = dataset.num_frames - sum(episode["length"] for episode in missing)
+    desc = f"Encoding {camera}" + (f", {size / 1e6:,.0f} MB" if size else "")
     # Frames of an earlier run are where the bar starts, not part of its rate.
-    with Progress(total=dataset.num_frames, initial=finished, unit="frame", desc=f"Encoding {camera}") as progress:
+    with Progress(total=dataset.num_frames, initial=finished, unit="frame", desc=desc) as progress:
         for episode in missing:
             batches = []
             for images in _ahead(_batches(dataset, key, episode, batch_size)):
-                batches.append(_encode(encoder, images, patches))
+                batches.append(_encode(encoder, images, bool(size)))
                 progress.update(len(images))
             pooled, tokens = zip(*batches, strict=True)
-            made = {PATCHES: tokens, ".npy": pooled} if patches else {".npy": pooled}
+            made = {PATCHES: tokens, ".npy": pooled} if size else {".npy": pooled}
             for suffix, arrays in made.items():  # the pooled ones last: they say that the episode is finished
                 with replaced(_part(parts, episode).with_suffix(suffix)) as partial:
                     np.save(partial, np.concatenate(arrays))

@@ -39,7 +39,7 @@ def settings(tmp_path_factory, tiny_weights):
     """A configuration file: two demonstrations, two rounds of two short episodes, a policy of random weights."""
     policy = {"type": "frozen_vit", "backbone": "vit_tiny16", "backbone_path": str(tiny_weights)}
     fields = {
-        "base": "smoke",
+        "base": "smoke --annotate=true",
         "policy": policy | {"readout": "heat_maps"},
         "training": {"epochs": 1, "batch_size": 64, "holdout": 2},
         "rounds": ROUNDS,
@@ -119,7 +119,8 @@ def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, set
     """The quick one of the test above: both episodes are driven, one is then damaged as a power cut may do it."""
     plan = Plan.of(parse(DaggerConfig, ["--repo_id=local/driven"], settings))
     store = Store(shutil.copytree(settings.parent / "store", tmp_path / "store", symlinks=True))
-    folder = store.folder(plan.round(1))
+    (driven,) = plan.round(1)
+    folder = store.folder(driven)
     before, asked, drive = hashes(folder), [], Round._drive
     shutil.rmtree(folder)
     order = "meta/stats.json"  # LeRobot lists columns in the order of a set; the whole data set's are sorted
@@ -134,9 +135,9 @@ def test_a_round_that_stopped_goes_on_with_the_episodes_that_are_whole(made, set
     monkeypatch.setattr(Round, "_drive", note)
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
         patch.setattr(rounds, "aggregate", stop)
-        store.get(plan.round(1))
+        store.get(driven)
     next(tmp_path.rglob(f"{asked[0][0]}/outcome.json")).write_text("")
-    store.get(plan.round(1))
+    store.get(driven)
     both = list(plan.seeds(1))
     assert asked == [both, both[:1]] and hashes(folder) | {order: None} == before | {order: None}
 

@@ -3,23 +3,17 @@
 The simulator is the toy of the data sets' tests; driving, advice and columns are the real ones.
 """
 
-import sys
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from toy_simulators import toy_simulators
 
 from lerobot_constructskill.contract import SIM_STATE, get_task
 from lerobot_constructskill.dagger import driving
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.columns import EXPERT, LEARNER, dagger_features
 from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
-from lerobot_constructskill.rollout import simulators
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "dataset"))
-from toy import ToyEnv  # noqa: E402
 
 TASK = get_task("brick_to_bin")
 EXPERTS = make_expert(TASK, ExpertConfig())
@@ -27,37 +21,8 @@ ENV = {"task": "brick_to_bin", "obs_type": "pixels", "episode_length": 150}
 SEEDS = [2_000_000, 2_000_001, 2_000_002]
 
 
-class Answered(dict):
-    """`Answers` that are there."""
-
-    def get(self):
-        return self
-
-
-class InThisProcess:
-    """`Simulators` of toys."""
-
-    def __init__(self, env_kwargs):
-        self.envs = [ToyEnv(**kwargs) for kwargs in env_kwargs]
-
-    def reset(self, seeds):
-        return Answered({number: simulators._reset(self.envs[number], seed) for number, seed in seeds.items()})
-
-    def step(self, actions):
-        answers = {}
-        for number, action in actions.items():
-            step = simulators._step(self.envs[number], action)
-            placed = step.done and self.envs[number].steps < ENV["episode_length"]
-            answers[number] = replace(step, info={"is_success": placed})
-        return Answered(answers)
-
-
 @pytest.fixture(autouse=True)
 def toys(monkeypatch):
-    @contextmanager
-    def toy_simulators(env_kwargs, n_workers=None):
-        yield InThisProcess(env_kwargs)
-
     monkeypatch.setattr(driving, "simulators", toy_simulators)
 
 

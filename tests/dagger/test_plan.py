@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 import lerobot_constructskill.plugin  # noqa: F401
+from lerobot_constructskill.contract import TASKS
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.errors import InputError
@@ -24,7 +25,7 @@ CONFIG = DaggerConfig("local/set", ACT, base=SEEN, rounds=3)
 
 def made(**fields):
     plan = Plan.of(replace(CONFIG, **fields))
-    rounds = [plan.round(number).digest for number in (1, 2, 3)]
+    rounds = [one.digest for number in (1, 2, 3) for one in plan.round(number)]
     return [plan.checkpoint(number).digest for number in range(4)], rounds
 
 
@@ -39,14 +40,45 @@ def test_names_places_and_how_it_is_run_change_nothing(fields):
 
 
 def test_the_action_of_the_base_is_that_of_the_rounds():
-    assert Plan.of(replace(CONFIG, base=f"{SEEN} --action=full")).env["action"] == "full"
-    assert "action" not in Plan.of(CONFIG).env
+    assert Plan.of(replace(CONFIG, base=f"{SEEN} --action=full")).envs[0]["action"] == "full"
+    assert "action" not in Plan.of(CONFIG).envs[0]
 
 
-@pytest.mark.parametrize("flag, said", [("--task=bins", "rounds are of one task"), ("--annotate=true", "language")])
-def test_a_base_that_no_round_is_like_is_refused(flag, said):
-    with pytest.raises(InputError, match=said):
-        Plan.of(replace(CONFIG, base=f"{SEEN} {flag}"))
+def test_each_task_of_the_base_is_driven_in_its_own_environment_with_its_own_expert():
+    plan = Plan.of(replace(CONFIG, base=f"{SEEN} --task=brick_to_bin,brick_on_brick --action=full --annotate=true"))
+    rounds = plan.round(2)
+    assert (
+        [one.task.name for one in rounds] == ["brick_to_bin", "brick_on_brick"] == [*plan.base.config.task.split(",")]
+    )
+    assert [one.env["episode_length"] for one in rounds] == [TASKS[one.task.name].horizon for one in rounds]
+    assert len({one.task.action_names for one in rounds}) == 1 and {one.env["action"] for one in rounds} == {"full"}
+    assert len({one.digest for one in rounds}) == 2 and {one.seeds for one in rounds} == {plan.seeds(2)}
+    merged = plan.data(2)
+    assert [*merged.inputs] == ["demonstrations", "round_1_0", "round_1_1", "round_2_0", "round_2_1"]
+    assert merged.parts == (plan.base, *plan.round(1), *rounds)
+
+
+def test_rounds_and_merged_sets_of_one_task_are_what_they_were_before_there_were_several():
+    """Their digests are of these, so that what stands in a store is found again."""
+    plan = Plan.of(CONFIG)
+    (driven,), merged = plan.round(2), plan.data(2)
+    env = {"task": "brick_to_bin", "obs_type": "pixels_agent_pos", "episode_length": TASKS["brick_to_bin"].horizon}
+    assert driven.facts() == {
+        "number": 2,
+        "beta": 0.0,
+        "patience": 20,
+        "seeds": [2_000_016, 2_000_032],
+        "environment": env | {name: plan.envs[0][name] for name in ("light_robot", "render_backend")},
+        "expert": vars(plan.base.config.expert),
+        "video": "av1",
+    }
+    assert dict(driven.inputs) == {"policy": plan.checkpoint(1)} and merged.facts() == {}
+    assert dict(merged.inputs) == {"demonstrations": plan.base, "round_1": plan.round(1)[0], "round_2": driven}
+
+
+def test_language_columns_of_a_wall_are_refused_before_anything_runs():
+    with pytest.raises(InputError, match="would not be exact in rounds of course_of_three"):
+        Plan.of(replace(CONFIG, base=f"{SEEN} --task=course_of_three --annotate=true"))
 
 
 def test_more_rounds_go_on_where_fewer_ended():
@@ -78,7 +110,7 @@ def test_all_labels_are_the_experts_and_advice_if_nothing_else_is_asked_for(labe
     assert Plan.of(replace(CONFIG, base="fast_executed_labels")).base.config.labels == "advice"
     with nullcontext() if taken else pytest.raises(InputError, match="DAgger needs the expert's"):
         plan = Plan.of(replace(CONFIG, base=f"{SEEN} --labels={labels}"))
-        assert (plan.round(1).digest == made()[1][0]) is (labels == "advice")
+        assert (plan.round(1)[0].digest == made()[1][0]) is (labels == "advice")
 
 
 def test_a_later_beta_changes_the_later_rounds_alone():
@@ -94,7 +126,7 @@ def test_seeds_of_rounds_never_meet():
 
 def test_a_hundred_rounds_are_planned_as_soon_as_three():
     plan = Plan.of(replace(CONFIG, rounds=100))
-    assert plan.round(3).digest == made()[1][2] and len({plan.data(number).digest for number in range(101)}) == 101
+    assert plan.round(3)[0].digest == made()[1][2] and len({plan.data(number).digest for number in range(101)}) == 101
 
 
 @pytest.mark.parametrize("policy, reads", [(ACT, True), (FROZEN_VIT, False), (FROZEN_VIT | {"use_state": True}, True)])

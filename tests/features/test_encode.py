@@ -5,6 +5,7 @@ import shutil
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_constructskill.artifacts.folders import MARK
-from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.errors import InputError, MachineError, UserError
 from lerobot_constructskill.features import encode as features_encode
 from lerobot_constructskill.features.encode import _ahead, load_encoder
 from lerobot_constructskill.features.points import POSES, find_points
@@ -157,6 +158,30 @@ def test_patch_features_on_request(source, weights, tmp_path):
     assert patches.shape == (sum(LENGTHS), 196, 192) and patches.dtype == np.float16
     np.testing.assert_allclose(patches, expected, atol=1e-2)
     assert len(LeRobotDataset("local/out", root=tmp_path / "out")) == sum(LENGTHS)
+
+
+def interrupted(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+def test_a_disk_without_room_for_the_patches_shows_before_they_are_encoded(
+    source, weights, tmp_path, monkeypatch, capfd
+):
+    asked = settings(source, weights, tmp_path / "out", camera="base+wrist", patches=True)
+    size = sum(LENGTHS) * 196 * 192 * 2  # bytes of a camera, which are there by episode and joined
+    disk = SimpleNamespace(free=4 * size - 1)
+    monkeypatch.setattr(features_encode.shutil, "disk_usage", lambda _: disk)
+    with pytest.raises(MachineError, match=r"has 2 MB free, and the patch features of 8 frames take 2 MB more"):
+        encode(asked)
+    assert not [*tmp_path.rglob("*.npy")]
+    disk.free += 1
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(features_encode, "_write_copy", interrupted)
+        encode(asked)
+    disk.free = 2 * size - 100  # a file of an episode has a header
+    encode(asked)
+    assert f"Encoding wrist, {size / 1e6:,.0f} MB" in capfd.readouterr().err
 
 
 @pytest.mark.slow

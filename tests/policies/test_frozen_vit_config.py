@@ -96,7 +96,7 @@ def test_the_state_is_an_input_on_request():
         ({}, OTHER | STATE, "the inputs are: observation.images.top, observation.state"),
         ({"camera": "wrist"}, CAMERA, "observation.images.wrist"),
         ({"use_state": True}, CAMERA, "use_state needs observation.state"),
-        ({"output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))}}, CAMERA, "shape"),
+        ({"output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))}}, CAMERA, "4 numbers .* set 7: give"),
     ],
 )
 def test_missing_inputs_are_named(fields: dict, inputs: dict, said: str):

@@ -268,7 +268,10 @@ class FrozenViTChunkConfig(PreTrainedConfig):
             raise InputError(f"use_state needs {OBS_STATE}; the inputs are: {', '.join(inputs)}.")
         shape = outputs[ACTION].shape if ACTION in outputs else (len(self.action_names),)
         if tuple(shape) != (len(self.action_names),):
-            raise InputError(f"The actions have shape {tuple(shape)}, but action_names are {self.action_names}.")
+            raise InputError(
+                f"The policy's actions have {len(self.action_names)} numbers ({', '.join(self.action_names)}), those "
+                f"of the environment or data set {shape[0]}: give both the same `action`, task or full."
+            )
         picture = PolicyFeature(FeatureType.VISUAL, (3, IMAGE_SIZE, IMAGE_SIZE))
         self.input_features = {key: inputs.get(key, picture) for key in self.image_keys}
         if self.use_state:
