@@ -19,7 +19,7 @@ import numpy as np
 from run import machine
 
 from lerobot_constructskill.artifacts.pools import cores, open_pool
-from lerobot_constructskill.board.protocol import FIRST_START, HORIZON
+from lerobot_constructskill.board.protocol import FIRST_START, steps_of
 from lerobot_constructskill.contract import OBS_TYPES, SHIPPED, get_task
 from lerobot_constructskill.demos.demonstrate import demonstrate
 from lerobot_constructskill.demos.expert import ExpertConfig, make_expert
@@ -150,10 +150,9 @@ def grasping(task: str, steps: int = GRASPED) -> list[np.ndarray]:
 
 def expert_places(task: str, perturb: str = "", seed: int = 0) -> int:
     """In how many of `STARTS` the expert places without noise."""
-    row = get_task(task)
-    length = row.horizon if row.plan else HORIZON
-    env = ConstructSkillEnv(task, episode_length=length, render_backend="none", perturb=perturb, perturb_seed=seed)
-    expert = make_expert(row, ExpertConfig())
+    drawn = {"perturb": perturb, "perturb_seed": seed}
+    env = ConstructSkillEnv(task, episode_length=steps_of(task), render_backend="none", **drawn)
+    expert = make_expert(get_task(task), ExpertConfig())
     placed = sum(demonstrate(env, expert, NoiseConfig(sigma=0.0), start)[1] for start in STARTS)
     env.close()
     return placed

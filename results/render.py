@@ -114,6 +114,7 @@ WORDS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
     "count": lambda arm: arm.met("placed").split("/")[0],
     "each": Arm.in_order,
+    "spread": Arm.spread,
     "draws": lambda arm: str(arm.draws.nunique()),
 }
 """Of links."""

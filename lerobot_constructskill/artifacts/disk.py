@@ -21,6 +21,21 @@ def disk_of(path: Path) -> Path:
     return next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
 
 
+def check_free(path: Path, needed: float, said: str) -> None:
+    """Refuse a disk with less than so many free bytes.
+
+    Args:
+        path: what is to be written, there or not.
+        said: the sentence's end, after how much is free: what takes how much, and what helps.
+
+    Raises:
+        MachineError: there is less.
+    """
+    disk = disk_of(path.parent)
+    if (free := shutil.disk_usage(disk).free) < needed:
+        raise MachineError(f"{disk} has {free / 1e6:,.0f} MB free{said}")
+
+
 def _says_so(error: OSError) -> bool:
     """NumPy checks the free space before it writes, and raises an OSError without a number."""
     return error.errno in (errno.ENOSPC, errno.EDQUOT) or "free space" in str(error)

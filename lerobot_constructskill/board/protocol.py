@@ -143,10 +143,11 @@ class Suite:
 
 
 def _settings(tasks: tuple[str, ...]) -> dict[str, BoardSetting]:
-    return {task: BoardSetting(task, 1 if task in FIXED else STARTS, _steps(task)) for task in tasks}
+    return {task: BoardSetting(task, 1 if task in FIXED else STARTS, steps_of(task)) for task in tasks}
 
 
-def _steps(task: str) -> int:
+def steps_of(task: str) -> int:
+    """Steps of an episode, of a task of one object or of a plan."""
     found = get_task(task)
     return found.horizon if found.plan else HORIZON
 

@@ -352,14 +352,14 @@ def check_rounds(data: DataSet) -> Iterator[str]:
     for entry in listed:
         number, first, rows = entry["round"], entry["seed_start"], data.rounds == entry["round"]
         rows = rows & (of_task == entry.get("task", of_task))  # of several tasks, a round is listed for each
-        which = f"ound {number}" + (f" of {entry['task']}" if "task" in entry else "")
+        which = f"round {number}" + (f" of {entry['task']}" if "task" in entry else "")
         counts, told = (int(rows.sum()), int(by_expert[rows].sum())), (entry["frames"], entry["by_expert"])
         seeds = sorted([*np.unique(data.column("sim.seed")[rows]).tolist(), *entry["discarded_seeds"]])
         yield from _found(
             {
-                f"R{which} has {counts[0]} frames, {counts[1]} by the expert; its provenance says {told[0]} and "
-                f"{told[1]}.": counts != told,
-                f"The seeds of r{which} and its discarded ones do not count up from {first}.": (
+                f"{which.capitalize()} has {counts[0]} frames, {counts[1]} by the expert; its provenance says "
+                f"{told[0]} and {told[1]}.": counts != told,
+                f"The seeds of {which} and its discarded ones do not count up from {first}.": (
                     not _counts(seeds, range(first, first + entry["episodes"]))
                 ),
             }

@@ -5,13 +5,12 @@ shards that it finished.
 """
 
 import logging
-import shutil
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from itertools import count
 from pathlib import Path
 
 from lerobot_constructskill.artifacts.code import check_unedited
-from lerobot_constructskill.artifacts.disk import disk_of
+from lerobot_constructskill.artifacts.disk import check_free
 from lerobot_constructskill.artifacts.folders import staged
 from lerobot_constructskill.artifacts.pools import Submit, open_pool
 from lerobot_constructskill.contract import DEMO_SEED_START, DEMO_SEED_STOP
@@ -19,7 +18,7 @@ from lerobot_constructskill.demos.merge import merge
 from lerobot_constructskill.demos.settings import GenerateConfig, frame_versions, frames_digest
 from lerobot_constructskill.demos.shards import ATTEMPT, OUTCOME, Attempt, Block, attempt, whole
 from lerobot_constructskill.demos.video import VIDEOS
-from lerobot_constructskill.errors import InputError, MachineError, plural
+from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -128,11 +127,9 @@ def check_disk(config: GenerateConfig, root: Path) -> None:
     episodes = config.episodes * len(config.rows)
     images = episodes * config.max_steps * len(config.seen)
     needed = 2 * VIDEOS[config.video].bytes_per_image * images
-    disk = disk_of(root.parent)
-    free = shutil.disk_usage(disk).free
-    if free < needed:
-        raise MachineError(
-            f"{disk} has {free / 1e6:,.0f} MB free and {plural(episodes, 'episode')} of up to "
-            f"{plural(config.max_steps, 'step')} can take up to {needed / 1e6:,.0f} MB: make room, name another root, "
-            "or ask for fewer."
-        )
+    check_free(
+        root,
+        needed,
+        f" and {plural(episodes, 'episode')} of up to {plural(config.max_steps, 'step')} can take up to "
+        f"{needed / 1e6:,.0f} MB: make room, name another root, or ask for fewer.",
+    )

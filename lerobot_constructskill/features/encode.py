@@ -12,10 +12,10 @@ from lerobot.utils import DEFAULT_FEATURES
 from torch import Tensor
 
 from lerobot_constructskill.artifacts.digests import data_sha256, digest
-from lerobot_constructskill.artifacts.disk import disk_of
+from lerobot_constructskill.artifacts.disk import check_free
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.contract import IMAGE_SIZE
-from lerobot_constructskill.errors import InputError, MachineError
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features.points import POSES, find_points
 from lerobot_constructskill.files import read_parquet
 from lerobot_constructskill.lerobot_internals import compute_episode_stats, decode_video_frames
@@ -118,7 +118,8 @@ def write_feature_set(
     }
     for name in each:
         _check_camera(dataset, name)
-    size = _check_disk(dataset, encoder, [*each.values()], folder) if patches else 0
+    size = dataset.num_frames * _patch_bytes(encoder) if patches else 0
+    _check_room(dataset, size, [*each.values()], folder)
     made = [_encode_frames(dataset, name, encoder, batch_size, parts, size) for name, parts in each.items()]
     columns = {feature_key(camera): np.concatenate(made, axis=1), **found}
     episodes = dataset.meta.episodes if patches else []
@@ -132,22 +133,27 @@ def _check_camera(dataset: LeRobotDataset, camera: str) -> None:
         raise InputError(f"The data set '{dataset.repo_id}' has no {key}; its cameras are: {cameras}.")
 
 
-def _check_disk(dataset: LeRobotDataset, encoder: FrozenEncoder, parts: Sequence[Path], folder: Path) -> int:
+def _patch_bytes(encoder: FrozenEncoder) -> int:
+    """Bytes that the features of an image's patches take."""
+    _, tokens = encoder.encode(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE, device=encoder.device))
+    return tokens.half().nbytes
+
+
+def _check_room(dataset: LeRobotDataset, size: int, parts: Sequence[Path], folder: Path) -> None:
     """Refuse a disk that could not hold every patch's feature twice, by episode and joined.
 
-    Returns:
-        Bytes that a camera's take, once.
+    Args:
+        size: bytes that those of one camera take.
+        parts: each camera's folder for finished episodes.
     """
-    _, tokens = encoder.encode(torch.zeros(1, 3, IMAGE_SIZE, IMAGE_SIZE, device=encoder.device))
-    size = dataset.num_frames * tokens.half().nbytes
     there = sum(file.stat().st_size for own in parts for file in own.glob(f"*{PATCHES}"))
-    disk, needed = disk_of(folder.parent), 2 * len(parts) * size - there
-    if (free := shutil.disk_usage(disk).free) < needed:
-        raise MachineError(
-            f"{disk} has {free / 1e6:,.0f} MB free, and the patch features of {dataset.num_frames:,} frames take "
-            f"{needed / 1e6:,.0f} MB more until they are put together: make room, or write to another disk."
-        )
-    return size
+    needed = 2 * len(parts) * size - there
+    check_free(
+        folder,
+        needed,
+        f", and the patch features of {dataset.num_frames:,} frames take {needed / 1e6:,.0f} MB more until they are "
+        "put together: make room, or write to another disk.",
+    )
 
 
 def join_feature_sets(

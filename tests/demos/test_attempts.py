@@ -165,7 +165,7 @@ def test_shards_serve_more_episodes_other_names_and_any_number_of_workers():
 
 def test_a_disk_that_is_too_small_is_told_before_anything_is_written(monkeypatch, tmp_path):
     usage = type("Usage", (), {"free": 10_000_000})
-    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda folder: usage)
+    monkeypatch.setattr(disk.shutil, "disk_usage", lambda folder: usage)
     with pytest.raises(OSError, match="10 MB free and 6 episodes") as error:
         record(replace(CONFIG, root=str(tmp_path / "deep" / "set")))
     assert "\n" not in str(error.value) and list(tmp_path.iterdir()) == []

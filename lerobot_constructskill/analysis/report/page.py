@@ -169,8 +169,8 @@ def _environment(finalize) -> Environment:
         finalize=finalize,
     )
     environment.filters |= {name: word for name, word in vars(formats).items() if callable(word)} | {"plural": plural}
-    functions = {function.__name__: function for function in (wrong_order, seeds_needed, detectable_spread_ratio)}
-    environment.globals |= functions | {"most": MOST}
+    environment.globals |= {"wrong_order": wrong_order, "seeds_needed": seeds_needed, "most": MOST}
+    environment.globals["detectable_spread_ratio"] = detectable_spread_ratio
     return environment
 
 
