@@ -150,8 +150,9 @@ def grasping(task: str, steps: int = GRASPED) -> list[np.ndarray]:
 
 def expert_places(task: str, perturb: str = "", seed: int = 0) -> int:
     """In how many of `STARTS` the expert places without noise."""
-    drawn = {"perturb": perturb, "perturb_seed": seed}
-    env = ConstructSkillEnv(task, episode_length=steps_of(task), render_backend="none", **drawn)
+    env = ConstructSkillEnv(
+        task, episode_length=steps_of(task), render_backend="none", perturb=perturb, perturb_seed=seed
+    )
     expert = make_expert(get_task(task), ExpertConfig())
     placed = sum(demonstrate(env, expert, NoiseConfig(sigma=0.0), start)[1] for start in STARTS)
     env.close()

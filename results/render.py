@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from lerobot_constructskill.analysis.report.formats import in_points, percent
@@ -63,30 +64,40 @@ class Arm:
         self.runs = _over(runs, len(settings))
         self.rows = own[own["training_seed"].isin(self.runs["training_seed"])]
         self.draws, self.units = (self.runs["training_seed"].map(of) for of in (draws.of, draws.unit))
+        if self.units.value_counts().nunique() > 1:  # a count of all would not be what the mean over draws says
+            raise SystemExit(f"A page names {name}, some of whose draws lack a seed: make these first.")
 
     def tell(self, number: Callable[["Arm"], str]) -> str:
         return "not run yet" if self.runs.empty else number(self)
 
     def met(self, criterion: str) -> str:
-        return f"{self.runs[criterion].sum()}/{self.runs['episodes'].sum()}"
+        """Its episodes that did, of all; one of a failed seed did not."""
+        return f"{self.runs[criterion].sum()}/{len(self.runs) * self.runs['episodes'].max()}"
+
+    def rates(self, criterion: str) -> np.ndarray:
+        """The share of each seed or, where several share a draw, of each draw."""
+        return by_unit(self.runs[f"{criterion}_rate"], self.units)
 
     def seeds(self, criterion: str) -> str:
-        counts = count(self.runs[f"{criterion}_rate"].to_numpy())
-        return f"{counts.met}/{counts.seeds}"
+        counts = count(self.rates(criterion))
+        return f"{counts.met}/{counts.seeds}{'' if self.units.is_unique else ' draws'}"
 
     def seeds_with_interval(self) -> str:
-        counts = count(by_unit(self.runs["placed_rate"], self.units))
+        counts = count(self.rates("placed"))
         return f"{counts.met}/{counts.seeds} ({_range(clopper_pearson(counts))} %)"
 
     @property
     def mean(self) -> Estimate:
-        return mean_rate(by_unit(self.runs["placed_rate"], self.units))
+        return mean_rate(self.rates("placed"))
 
     def episodes(self) -> str:
         return f"{self.met('placed')}: {percent(self.mean.value)} ({_range(self.mean)})"
 
+    def worst(self) -> str:
+        return f"{self.rates('placed').min() * self.runs['episodes'].max():g}"
+
     def spread(self) -> str:
-        rates = by_unit(self.runs["placed_rate"], self.units)
+        rates = self.rates("placed")
         if len(rates) < 2:
             return "–"
         chance = chance_of(self.rows, "placed") if self.units.is_unique else None
@@ -115,6 +126,7 @@ WORDS: dict[str, Callable[[Arm], str]] = {
     "count": lambda arm: arm.met("placed").split("/")[0],
     "each": Arm.in_order,
     "spread": Arm.spread,
+    "worst": Arm.worst,
     "draws": lambda arm: str(arm.draws.nunique()),
 }
 """Of links."""
@@ -125,6 +137,7 @@ LINK = re.compile(
 
 HEADS: dict[str, Callable[[Arm], str]] = {
     "placed": lambda arm: arm.met("placed"),
+    "placed, each on a draw of its own": lambda arm: arm.met("placed"),
     "lifted": lambda arm: arm.met("lifted"),
     "interval, %": lambda arm: _range(arm.mean),
     "spread, by chance": Arm.spread,

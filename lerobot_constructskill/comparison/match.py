@@ -79,7 +79,7 @@ class Prepared:
         a, b: the sides; None for checkpoints, which are to be evaluated.
         env: keyword arguments of the `ConstructSkillEnv` that both act in.
         starts: as in `MatchedSides`.
-        apart: starts of each training seed, where draws have starts of their own.
+        apart: starts of each draw, where draws have starts of their own.
     """
 
     sources: tuple[Source, Source]
@@ -164,25 +164,25 @@ def _rate(placed: Sequence[bool]) -> float:
 
 
 def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:
-    """Starts of each training seed, where both sides are known and their draws have the same starts of their own.
+    """Starts of each draw, where both sides are known and their draws have the same starts of their own.
 
-    A seed that failed has those of the other side.
+    How many seeds a draw has does not matter. A seed that failed may be the only one of its draw.
 
     Raises:
-        InputError: of one side seeds have starts of their own, and the other side has not the same.
+        InputError: of one side draws have starts of their own, and the other side has not the same.
     """
-    each = [side.starts_of_each for side in known]
-    if len(each) == 2 and len(each[0]) == len(each[1]):
-        pairs = [*zip(*each, strict=True)]
-        merged = [a or b for a, b in pairs]
-        if are_apart(merged) and all(a == b for a, b in pairs if a and b):
-            return merged
     own = next((side for side in known if are_apart(side.starts_of_each)), None)
     if own is None:
         return None
+    draws = [{frozenset(starts) for starts in side.starts_of_each if starts} for side in known]
+    every = [*map(set, set.union(*draws))]
+    lacking = [len(every) - len(one) for one in draws]
+    failed = [side.starts_of_each.count(set()) for side in known]
+    if len(known) == 2 and are_apart(every) and all(a <= b for a, b in zip(lacking, failed, strict=True)):
+        return every
     raise InputError(
-        f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose training "
-        "seeds have the same ones."
+        f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose draws have "
+        "the same ones (the same `demonstrations`, `starts`, `eval_seed` and `episodes`, and as many draws)."
     )
 
 

@@ -280,8 +280,16 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
     assert "What the spread between runs is made of" in said[False] and "figures/fixed_draws.png" in said[False]
     assert "6/6 (54–100 %)" in said[True] and "3/3 (29–100 %)" in said[False]
     assert "| draws that placed |" in said[False] and "a draw counts once" in said[False]
+    assert "3 draws of demonstrations, 2 training seeds on each" in said[False]
+    assert re.search(r"one \| 5\.8 \(.*\) \| 2\.5 \|", said[False]), "the worst draw"
     mean = {shared: re.search(r"5\.8 \(([\d.]+)–([\d.]+)\)", text).groups() for shared, text in said.items()}
     assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])
+    lacks = [row for row in rows if row.training_seed < 5] + [missing_row(drawn, ("fixed", "one", 5))]
+    write_study(tmp_path / "lacks", drawn | {"demonstrations": "own", "starts": "own", "seeds_a_draw": 2}, lacks)
+    report(ReportConfig(tmp_path / "lacks"))
+    text = (tmp_path / "lacks" / "report.md").read_text()
+    assert re.search(r"one \| 5\.7 \(.*\) \| 2\.5 \|", text), "(8.5 + 2.5 + 6) / 3, not (9 + 8 + 2 + 3 + 6) / 5"
+    assert "1 of 6 runs are missing" in text and "3/3 (29–100 %)" in text
 
 
 def test_walls_are_told_by_their_chains_and_where_these_break(tmp_path, no_figures):

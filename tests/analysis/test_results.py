@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import shutil
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -54,7 +55,13 @@ def test_a_published_study_is_one_of_configs_with_as_many_seeds_or_fewer(folder)
     study, config = load(folder / "study.yaml"), load(ROOT / "configs" / "study" / f"{folder.name}.yaml")
     for part in ("name", "episodes"):
         assert study[part] == config[part]
-    assert study["eval_seed"] == config.get("eval_seed", 1000)
+    for part, default in {
+        "eval_seed": 1000,
+        "demonstrations": "shared",
+        "starts": "shared",
+        "seeds_a_draw": 1,
+    }.items():
+        assert study.get(part, default) == config.get(part, default)
     assert config.get("training", {}).items() <= study["training"].items()
     for name, setting in config["settings"].items():
         assert study["settings"][name]["env"] == setting["env"]
@@ -110,6 +117,29 @@ def test_a_mean_counts_each_seed_that_ran_in_all_of_its_settings(tmp_path):
     assert [one["text"] for one in render.LINK.finditer(render.render(page))] == ["2/4", "2, 3"]
     page.write_text(f'| spread, by chance | rows |\n|---|---|\n| | [small]({report_file} "both, again/two") |\n')
     assert "| 12.5, " in render.render(page)  # 2 and 3 of 4
+
+
+def test_a_draw_counts_once_and_a_page_shows_none_that_lacks_a_seed(tmp_path):
+    study = SMALL | {"variants": {"one": {"seeds": 6}}, "episodes": 10}
+    study |= {"demonstrations": "own", "starts": "own", "seeds_a_draw": 2}
+    runs = [*planned(study)]
+    rows = [episode_rows(study, run, 10, placed) for run, placed in zip(runs, [0, 0, 2, 3, 6, 7], strict=True)]
+    page = tmp_path / "page.md"
+
+    def tell(rows) -> str:
+        report_file = f"{write_study(tmp_path, study, rows)}/report.md"
+        page.write_text(
+            "| seeds that placed | placed | rows |\n|---|---|---|\n"
+            f'| | | [small]({report_file} "fixed/one") |\n\n[]({report_file} "worst fixed/one")\n'
+        )
+        return render.render(page)
+
+    text = tell([*chain(*rows)])
+    assert "| 2/3 draws | 18/60 |" in text and "[0](" in text
+    text = tell([*chain(*rows[:4]), failed_row(study, runs[4], "broken"), *rows[5]])
+    assert "| 2/3 draws | 12/60 |" in text, "a failed seed placed in no episode"
+    with pytest.raises(SystemExit, match="fixed/one, some of whose draws lack a seed"):
+        tell([*chain(*rows[:5]), missing_row(study, runs[5])])
 
 
 def test_a_mean_with_a_failed_run_is_no_number(tmp_path):

@@ -373,10 +373,27 @@ def test_the_spread_is_split_as_an_analysis_of_variance_splits_it(deviations, rn
         (squares["draws"] - squares["seeds"] - squares["starts"] + squares["rest"]) / (seeds * starts),
         (squares["seeds"] - squares["rest"]) / starts,
         (squares["starts"] - squares["rest"]) / seeds / starts,
+        squares["rest"] / starts,
     )
     for estimate, variance in zip(split(episodes), variances, strict=True):
         assert estimate.value == pytest.approx(np.sqrt(max(variance, 0)), abs=0.004)
         assert estimate.low <= estimate.value <= estimate.high
+
+
+@pytest.mark.nightly
+def test_intervals_over_ten_draws_cover_what_they_should(rng):
+    """Two seeds a draw and fifty starts, as in `draws`."""
+    found = [split(drawn_episodes(rng, 10, 2, 50, (0.15, 0.03, 0.05))) for _ in range(60)]
+    assert np.mean([one.draws.low <= 0.15 <= one.draws.high for one in found]) > 0.85
+    left = 0.25 - 0.15**2 - 0.03**2 - 0.05**2  # the mean variance of an episode, whose chance moves about one half
+    assert np.mean([one.episodes.value for one in found]) == pytest.approx(np.sqrt(left / 50), rel=0.02)
+
+
+def test_an_interval_over_draws_that_vary_most_is_that_of_a_variance_of_so_many_numbers(rng):
+    """Of ten, half to twice as much; of two, next to nothing is known."""
+    ten, two = (split(drawn_episodes(rng, draws, 3, 200, (0.2, 0.0, 0.0))).draws for draws in (10, 2))
+    assert [ten.low / ten.value, ten.high / ten.value] == pytest.approx([0.69, 1.83], abs=0.04)  # chi-squared, 9
+    assert two.high > 0.5, "which a report calls not determined"
 
 
 def test_what_cannot_be_told_apart_is_not(rng):

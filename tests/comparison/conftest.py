@@ -40,7 +40,7 @@ def study(tmp_path):
                 fault = {"error_kind": "fault" if count is None else NOT_RUN, "error": "it fell"}
                 rows.append(Row(training_seed=seed, evaluation_seed=starts[0], episode=0, **fault, **common))
                 continue
-            moved = seed * len(starts) if draws.get("starts") == "own" else 0
+            moved = seed // draws.get("seeds_a_draw", 1) * len(starts) if draws.get("starts") == "own" else 0
             for i, start in enumerate(starts):
                 rows.append(
                     Row(training_seed=seed, evaluation_seed=moved + start, episode=i, placed=i < count, **common)

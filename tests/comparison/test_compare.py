@@ -114,6 +114,17 @@ def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, 
             compared(study(GOOD, f"own {len(other)}", draws=own), other)
 
 
+def test_draws_with_starts_of_their_own_may_have_different_numbers_of_seeds(study):
+    own = {"demonstrations": "own", "starts": "own"}
+    one = study([9, 2, 5], draws=own)
+    two = study([9, 7, 2, 2, 5, 5], "two", draws=own | {"seeds_a_draw": 2})
+    comparison = compared(one, two)
+    assert comparison.judgement.counts_a.seeds == comparison.judgement.counts_b.seeds == 3
+    assert comparison.rates_b == [0.9, 0.7, 0.2, 0.2, 0.5, 0.5] and len(comparison.starts) == 30
+    with pytest.raises(InputError, match="has starts of its own: .* and as many draws"):
+        compared(one, study([9, 7, 2, 2], "fewer", draws=own | {"seeds_a_draw": 2}))
+
+
 def test_a_failed_seed_whose_draw_has_starts_of_its_own_placed_nothing(study):
     own = {"demonstrations": "own", "starts": "own"}
     comparison = compared(study([9, None, 8, 7], draws=own), study([5, 5, 5, 5], "other", draws=own))

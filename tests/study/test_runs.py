@@ -548,6 +548,26 @@ def test_rows_of_other_code_are_replaced_an_arm_at_a_time(tmp_path):
         run_study(fewer, "", tmp_path / "x", mine, Options(replace=True))
 
 
+def test_the_times_of_rows_that_are_replaced_go_with_them(tmp_path, monkeypatch):
+    table = make_all(study(), tmp_path)
+    folder, mine = tmp_path / "x", Store(tmp_path / "mine")
+    write_rows([replace(row, run=None) for row in load_rows(folder / ROWS)], folder / ROWS)
+    monkeypatch.setattr(session, "make_runs", lambda job: iter(()))
+    monkeypatch.setattr(session, "validate", lambda *_: None)
+
+    def times_after(only: str) -> list[str]:
+        for arm in ("fixed/a", "fixed/b"):
+            with timed(folder, arm, "training", 1):
+                pass
+        run_study(study(), "", folder, mine, Options(only=only, replace=True))
+        return [entry["arm"] for entry in entries(folder)]
+
+    assert times_after("fixed/a") == ["fixed/b"]
+    run = next(run for run in table.runs if run.id == "fixed/a/seed_1")
+    shutil.copytree(table.store.folder(run), mine.folder(run))
+    assert times_after("fixed/a") == ["fixed/b", "fixed/a", "fixed/b"], "some of its rows are of today's code"
+
+
 def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_path):
     table = make_all(study(), tmp_path)
     published = read_rows(tmp_path / "x" / "rows.parquet")

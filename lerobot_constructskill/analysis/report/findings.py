@@ -21,6 +21,7 @@ class Success(NamedTuple):
             for seeds, here and below.
         exact: share of those seeds with Clopper-Pearson's interval.
         mean: share of episodes, averaged over seeds, with Gaffke's interval.
+        worst: the smallest of these shares.
         spread: standard deviation of that share over seeds (divisor n), in [0, 0.5].
         chance: the same, were all seeds alike, as `spread_by_chance` says; None where draws stand for seeds, a seed
             failed, seeds have different starts, or there is one start.
@@ -29,6 +30,7 @@ class Success(NamedTuple):
     counts: Counts
     exact: Estimate
     mean: Estimate
+    worst: float
     spread: float
     chance: float | None
 

@@ -83,7 +83,7 @@ def write_report(root: Path) -> Path:
         "study": read_text(root / STUDY),
         "findings": findings,
         "covered": draws.covered,
-        "groups_seeds": draws.groups_seeds,
+        "seeds_a_draw": draws.seeds_a_draw if draws.groups_seeds else 1,
         "films": partial(films, root, rows),
         "facts": provenance(root, rows),
         "stages": time_by_stage(root),

@@ -190,7 +190,7 @@ def _success(runs: pd.DataFrame, episodes: pd.DataFrame | None, criterion: str) 
     counts = count(rates)
     has_chance = episodes is not None and not runs["unit"].duplicated().any()
     chance = chance_of(episodes, criterion) if has_chance else None
-    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.std()), chance)
+    return Success(counts, clopper_pearson(counts), mean_rate(rates), float(rates.min()), float(rates.std()), chance)
 
 
 def _rates(runs: pd.DataFrame, criterion: str) -> np.ndarray:

@@ -1,17 +1,15 @@
-"""What the spread between runs is made of: draws of demonstrations, training seeds on one draw, and starts."""
+"""What the spread between runs is made of: draws of demonstrations, training seeds on one draw, starts and chance."""
 
 import warnings
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.stats import chi2
 from statsmodels.regression.mixed_linear_model import MixedLM, MixedLMResults
 from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate
-
-NORMAL = 1.96
-"""Quantile of the standard normal distribution for an interval of 95 %."""
 
 
 class Components(NamedTuple):
@@ -21,18 +19,22 @@ class Components(NamedTuple):
         draws: between draws of demonstrations.
         seeds: between training seeds on one draw.
         starts: between lists of as many starts as a run has.
+        episodes: what is left: single episodes of one policy from one start, over as many of them.
     """
 
     draws: Estimate
     seeds: Estimate
     starts: Estimate
+    episodes: Estimate
 
 
 def split(episodes: pd.DataFrame) -> Components | None:
     """Split the spread by a linear mixed model of the episodes, fitted by restricted maximum likelihood.
 
     A linear model of outcomes that are 0 or 1 gives components in points, which add up; those of a logistic one have
-    no such meaning. The intervals are Wald's of the logarithm: 0 to infinity where a component is estimated as 0.
+    no such meaning. The intervals are Satterthwaite's (Biometrics Bulletin 2, 1946): chi-squared, with the degrees of
+    freedom that the standard error of a variance stands for. They are wide over few draws, and 0 to infinity where a
+    component is estimated as 0.
 
     Args:
         episodes: a row an episode: `draw`, `training_seed`, `evaluation_seed` and whether it succeeded, `met`.
@@ -58,9 +60,11 @@ def split(episodes: pd.DataFrame) -> Components | None:
         found = _deviations(fit, model.exog_vc.names)
     if not np.isfinite([one.value for one in found.values()]).all():
         return None
+    found["episodes"] = _deviation(fit.scale, fit.scale * np.sqrt(2 / len(episodes)))
     a_run = np.sqrt(episodes.groupby(["draw", "training_seed"])["evaluation_seed"].nunique().mean())
-    starts = Estimate(*(float(value / a_run) for value in found["starts"]))
-    return Components(found["draws"], found["seeds"], starts)
+    for name in ("starts", "episodes"):
+        found[name] = Estimate(*(float(value / a_run) for value in found[name]))
+    return Components(**found)
 
 
 def _is_told_by_one(episodes: pd.DataFrame) -> bool:
@@ -80,6 +84,6 @@ def _deviation(variance: float, error: float) -> Estimate:
     """The root of a variance with this standard error, and its interval."""
     if variance <= 0 or not np.isfinite(error):
         return Estimate(float(np.sqrt(max(variance, 0))), 0.0, float("inf"))
-    factor = float(np.exp(NORMAL * error / (2 * variance)))
-    value = float(np.sqrt(variance))
-    return Estimate(value, value / factor, value * factor)
+    freedom = 2 * (variance / error) ** 2
+    low, high = (float(np.sqrt(variance * freedom / chi2.ppf(level, freedom))) for level in (0.975, 0.025))
+    return Estimate(float(np.sqrt(variance)), low, high)
