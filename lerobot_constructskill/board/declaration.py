@@ -14,6 +14,11 @@ VERSION = 1
 UNSEEING = ", none rendering"
 """End of a backend that shows no pictures."""
 
+BACKEND = Pattern(
+    r"[a-z_]+(:\d+)?, (none|(sapien_)?(cpu|gpu|cuda)(:\d+)?) rendering",
+    "what simulated and what rendered, such as 'physx_cpu, sapien_cpu rendering'",
+)
+
 MOST_EPISODES, MOST_SETTINGS, MOST_BYTES = 50_000, 32, 1 << 30
 """Episodes and settings of a submission, and bytes of its actions unpacked."""
 
@@ -128,7 +133,7 @@ class Declaration:
     suite: Annotated[str, Among(tuple(BOARD_SUITES))]
     settings: dict[str, BoardSetting]
     training_seeds: Annotated[list[Seed], NotEmpty()]
-    backend: Line
+    backend: Annotated[str, BACKEND]
     versions: dict[Line, Line]
     episodes_sha256: Hash
     trained: Trained | None = None

@@ -13,7 +13,7 @@ from lerobot_constructskill.analysis.stats.walls import over_seeds
 from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS, PublicValue
-from lerobot_constructskill.board.recovered import Recovery, path_of, read_recovered
+from lerobot_constructskill.board.recovered import Recovery, is_current, path_of, read_recovered
 from lerobot_constructskill.board.rerun import check_later
 from lerobot_constructskill.board.submission import SCORES, Claim, Submission, read_submission
 from lerobot_constructskill.board.verification import different, read_verification
@@ -72,6 +72,7 @@ class Entry:
         level: one of `protocol.LEVELS`.
         verdict: result of its verification; empty if it was not verified.
         recoveries: where its failed episodes were lost, by setting, training seed and start; empty if unknown.
+        recoveries_are_older: whether they were found by code that is no longer this one.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Entry:
     level: str
     verdict: dict[str, Any]
     recoveries: dict[tuple[str, int, int], Recovery]
+    recoveries_are_older: bool = False
 
     @property
     def declaration(self) -> Declaration:
@@ -104,6 +106,14 @@ class Entry:
     def rerun_value(self) -> PublicValue | None:
         """The public value that the starts of its re-run came from."""
         return PublicValue.of(self.verdict["rerun"]["value"]) if "rerun" in self.verdict else None
+
+    @property
+    def failures(self) -> list[Claim]:
+        """Its episodes that can be searched: executed, not placed, of a policy, with physics that can be replayed."""
+        if not self.declaration.is_replayable or self.is_reference:
+            return []
+        claims = [one for one in self.submission.claims if one.error is None and not one.placed]
+        return sorted(claims, key=lambda claim: claim.key)
 
     @property
     def missing_seeds(self) -> int:
@@ -220,8 +230,10 @@ def _entry(root: Path, path: Path) -> Entry:
     verdict = read_verification(root / VERIFIED / f"{path.name}.json", submission.sha256)
     if "rerun" in verdict:
         check_later(PublicValue.of(verdict["rerun"]["value"]), str(verdict["date"]))
-    recoveries = read_recovered(path_of(root, path.name), submission.sha256)
-    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, recoveries)
+    table = path_of(root, path.name)
+    recoveries = read_recovered(table, submission.sha256)
+    is_older = bool(recoveries) and not is_current(table, submission.sha256)
+    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, recoveries, is_older)
 
 
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:

@@ -11,6 +11,9 @@ from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.recovered import FAILED, Recovery
 from lerobot_constructskill.errors import plural
 
+FEWEST = 10
+"""Failures below which nothing is said of how seeds differ in them."""
+
 
 @dataclass(frozen=True)
 class Losses:
@@ -80,9 +83,12 @@ def by_seed(losses: Losses) -> dict[int, Losses]:
     return _grouped(losses.rows, lambda row: row.training_seed)
 
 
-def depends_on_seed(losses: Losses) -> float:
-    """P-value of a permutation test whether what was lost depends on the training seed."""
-    return association([row.training_seed for row in losses.rows], [row.lost for row in losses.rows])
+def depends_on_seed(losses: Losses) -> str:
+    """Whether what was lost depends on the training seed: the p-value of a permutation of episodes from one start."""
+    if len(losses.rows) < FEWEST:
+        return "too few failures to tell"
+    of_each = ([getattr(row, name) for row in losses.rows] for name in ("training_seed", "lost", "evaluation_seed"))
+    return f"p = {p_value(association(*of_each))}"
 
 
 def checked(rows: Iterable[Recovery]) -> tuple[int, int, int, int]:
@@ -105,7 +111,7 @@ def tell(entry: Entry) -> list[str]:
     """A sentence for each setting in which an entry failed."""
     return [
         f"{entry.name}, {setting}: {plural(len(own.rows), 'failed episode')}: {own.lost}; still placed from the end, "
-        f"with more time: {own.at_the_end}; depends on the training seed: p = {p_value(depends_on_seed(own))}"
+        f"with more time: {own.at_the_end}; depends on the training seed: {depends_on_seed(own)}"
         for setting, own in by_setting(entry.recoveries.values()).items()
     ]
 

@@ -27,6 +27,9 @@ RECIPE = Yaml("a recipe, the fields of a study", dict[str, Any])
 A_PATH = re.compile(r"[/~.\\]|.*(\.\.|\\)|.*\.(ya?ml|json|safetensors|ckpt|bin|pth?|py|parquet)$")
 """Text that names a file, from its beginning on."""
 
+UNPINNED = re.compile(r"(hf/)?[\w-][\w.-]*/[\w-][\w.-]*")
+"""Weights on the Hub of no commit: they may be others tomorrow."""
+
 ON_THE_HUB, COMMIT = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*"), re.compile("[0-9a-f]{40}")
 
 
@@ -78,11 +81,24 @@ def check_plain(values: Mapping[str, Any]) -> None:
         if field.endswith("path"):
             also = " without pretrained_revision, a commit on the Hub" * (field == "pretrained_path")
             raise InputError(f"A recipe names no file, and {where} is {text!a:.80}{also}.")
+        if ".policy." in where and UNPINNED.fullmatch(text):
+            raise InputError(
+                f"A recipe names weights on the Hub by their commit, NAME@COMMIT: {where} is {text!a:.80}."
+            )
         kind = {"data": "generate", "dagger": "dagger"}.get(field)
         if kind and not name.startswith("--") and name not in names(kind):
             raise InputError(f"A recipe names shipped configurations, and {where} is {name!a:.80}.")
         if (plan := text.partition(PLANNED)[2]) and plan not in names("plan"):
             raise InputError(f"A recipe names shipped plans, and {where} is {text!a:.80}.")
+
+
+def starts_from(values: Mapping[str, Any]) -> str:
+    """The weights that the policy of a recipe starts from, NAME@COMMIT; empty where it starts from none."""
+    policies = [variant["policy"] for variant in values["variants"].values()]
+    names = {
+        f"{one['pretrained_path']}@{one['pretrained_revision']}" for one in policies if one.get("pretrained_path")
+    }
+    return ", ".join(sorted(names))
 
 
 def _texts(value: Any, where: str = "") -> Iterator[tuple[str, str]]:

@@ -36,14 +36,6 @@ DRAWN = 50
 """Of so many failures one is drawn by its hash, in which every tenth step is tried."""
 
 
-def failures(entry: Entry) -> list[Claim]:
-    """The episodes that can be searched: executed, not placed, and with physics that can be replayed."""
-    if not entry.declaration.is_replayable or entry.is_reference:
-        return []
-    claims = [one for one in entry.submission.claims if one.error is None and not one.placed]
-    return sorted(claims, key=lambda claim: claim.key)
-
-
 def write_missing(root: Path, entries: Sequence[Entry], workers: int | None = None) -> list[Path]:
     """Write the tables of some entries that are not there, those of few failures first.
 
@@ -60,7 +52,7 @@ def write_missing(root: Path, entries: Sequence[Entry], workers: int | None = No
         OSError: a worker died.
     """
     due = [one for one in entries if not is_current(path_of(root, one.name), one.submission.sha256)]
-    failed = {one.name: own for one in due if (own := failures(one))}
+    failed = {one.name: own for one in due if (own := one.failures)}
     order = sorted((one for one in due if one.name in failed), key=lambda one: len(failed[one.name]))
     total = sum(map(len, failed.values()))
     with open_workers(workers) as submit, Progress(total=total, desc="recover", unit="episode") as bar:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,11 @@ from lerobot_constructskill.artifacts.revisions import PREFIX
 from lerobot_constructskill.artifacts.store import Store
 from lerobot_constructskill.board.declaration import Trained
 from lerobot_constructskill.board.protocol import BoardSetting, environment_key
-from lerobot_constructskill.board.recipe import read_recipe
+from lerobot_constructskill.board.recipe import read_recipe, starts_from
 from lerobot_constructskill.board.rerun import confirm, describe
 from lerobot_constructskill.board.submission import Claim, Submission
 from lerobot_constructskill.board.verification import different
-from lerobot_constructskill.contract import get_task
+from lerobot_constructskill.contract import OBS_TYPES, get_task
 from lerobot_constructskill.envs.recording import RECORDINGS, read_recordings
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.lerobot_internals import load_plugins
@@ -40,14 +41,27 @@ class TrainedAgain:
         rates: for each setting the share of episodes that placed, as submitted and trained again.
         others: what else this machine or this package has than the first, and both; empty where all weights and
             episodes are the same to the last bit.
+        starts_from: weights on the Hub that the policies start from, NAME@COMMIT; empty where these are new.
     """
 
     rates: dict[str, tuple[float, float]]
     others: dict[str, tuple[str, str]]
+    starts_from: str
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """It as a verdict shows it."""
+        origin = {"starts_from": self.starts_from} if self.starts_from else {}
+        return {"exact": not self.others, "settings": self.rates} | origin
 
     @property
     def told(self) -> str:
-        """It as a sentence."""
+        """It as sentences."""
+        origin = f" Training starts from {self.starts_from}, of which it tells nothing." if self.starts_from else ""
+        return self._compared + origin
+
+    @property
+    def _compared(self) -> str:
         if not self.others:
             return "Trained again, all weights and episodes are the same to the last bit."
         why = "; ".join(f"{name} {there:.60} there, {here} here" for name, (there, here) in self.others.items())
@@ -73,7 +87,7 @@ def study_of(submission: Submission, allowed: Sequence[str] = ()) -> Study:
     return study
 
 
-def retrain(submission: Submission, study: Study, root: Path, workers: int) -> TrainedAgain:
+def retrain(submission: Submission, study: Study, root: Path, options: Options) -> TrainedAgain:
     """Make all that a submission's recipe says, and compare. After a kill the same call continues.
 
     With the same packages, rooms and processor, weights and episodes must be the same to the last bit. Elsewhere a
@@ -82,7 +96,7 @@ def retrain(submission: Submission, study: Study, root: Path, workers: int) -> T
     Args:
         study: as `study_of` returns it.
         root: where it is made: a store for all recipes, which nothing else was made in, and a study for each.
-        workers: processes that generate demonstrations.
+        options: how it is made: the processes that generate demonstrations, and the executor.
 
     Raises:
         InputError: the submission has no recipe, or its recipe makes others.
@@ -91,7 +105,7 @@ def retrain(submission: Submission, study: Study, root: Path, workers: int) -> T
     if (trained := submission.declaration.trained) is None:
         raise InputError(NO_RECIPE)
     store, text = Store((root / "store").absolute()), submission.recipe or ""
-    table = run_study(study, text, root.absolute() / submission.sha256[:16], store, Options(workers=workers))
+    table = run_study(study, text, root.absolute() / submission.sha256[:16], store, options)
     return _compare(submission, trained, table)
 
 
@@ -122,23 +136,25 @@ def _check_runs(submission: Submission, study: Study, runs: Sequence[Run]) -> No
         there = environment_key(env["task"], env["episode_length"], env["perturb"], env["perturb_seed"])
         if there != environment_key(**setting.environment) or not {*setting.starts} <= {*run.arm.starts}:
             raise InputError(f"The recipe evaluates {run.arm.setting} otherwise than the submission does.")
-        if declaration.about.observes == "pixels" and env["obs_type"] != "pixels":
-            raise InputError(f"The recipe shows its policies {env['obs_type']}; the submission says pixels.")
+        said, shown = declaration.about.observes, env["obs_type"]
+        if said in OBS_TYPES and [*OBS_TYPES].index(shown) > [*OBS_TYPES].index(said):  # each shows more than the last
+            raise InputError(f"The recipe shows its policies {shown}; the submission says {said}.")
 
 
 def _compare(submission: Submission, trained: Trained, table: Table) -> TrainedAgain:
     rows = {(run.arm.setting, run.seed): table.made(run) or [] for run in table.runs}
     rates = _rates(submission, rows)
     versions = [one.versions for own in rows.values() for one in own if one.versions]
-    here = merged(map(json.loads, versions))
+    here, origin = merged(map(json.loads, versions)), starts_from(read_recipe(submission.recipe or ""))
     if others := different(trained.made_with, here):
-        return TrainedAgain(confirm(rates, "training seeds", AGAIN), others)
+        return TrainedAgain(confirm(rates, "training seeds", AGAIN), others, origin)
     if unlike := next(_unlike(submission, trained, table), None):
         raise InputError(
             f"Trained again with the same versions on the same kind of processor, {unlike}. So the recipe, a seed or "
             "the episodes are others than it says, unless this machine renders other pictures (another Mesa)."
         )
-    return TrainedAgain({name: (float(own.mean()), float(again.mean())) for name, (own, again) in rates.items()}, {})
+    shares = {name: (float(own.mean()), float(again.mean())) for name, (own, again) in rates.items()}
+    return TrainedAgain(shares, {}, origin)
 
 
 def _unlike(submission: Submission, trained: Trained, table: Table) -> Iterator[str]:

@@ -7,7 +7,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report.formats import p_value, percent, share_range, whole
+from lerobot_constructskill.analysis.report.formats import percent, share_range, whole
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.board.entries import Entry, Standing, ranks, read_entries
 from lerobot_constructskill.board.explained import drawn, laid, meaning, picture
@@ -79,6 +79,7 @@ def _suite_page(name: str, entries: list[Entry], out: Path, common: dict[str, An
         fewest=RANKED_FROM,
         cells=CELLS,
         failed=[one for entry in own for one in entry.recoveries.values()],
+        unsearched={one.name: n for one in own if not one.recoveries and (n := len(one.failures))},
         meanings=MEANING,
         patience=PATIENCE,
         strides=STRIDES,
@@ -121,7 +122,7 @@ def _render(template: str, **context) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"percent": percent, "share_range": share_range, "plural": plural, "grid": grid}
-    environment.filters |= {"by_setting": by_setting, "by_seed": by_seed, "checked": checked, "p_value": p_value}
+    environment.filters |= {"by_setting": by_setting, "by_seed": by_seed, "checked": checked}
     environment.filters |= {"depends_on_seed": depends_on_seed, "number": whole, "rates": describe}
     environment.filters |= {"meaning": meaning, "picture": picture, "drawn": drawn, "laid": laid}
     return environment.get_template(template).render(**context)

@@ -32,9 +32,10 @@ class Rerun(Rates):
 
 
 class Retrained(Rates):
-    """Training again, and whether weights and episodes were the same to the bit."""
+    """Training again, whether weights and episodes were the same to the bit, and the weights that it started from."""
 
     exact: bool
+    starts_from: NotRequired[str]
 
 
 class Verification(TypedDict):
@@ -61,7 +62,7 @@ def read_verification(path: Path, submission: str) -> dict[str, Any]:
     if not os.path.lexists(path):
         return {}
     found = {"machines": []} | VERIFICATION.read(path)
-    if (shown := RATES_OF.get(found["level"])) and shown not in found:
+    if (shown := RATES_OF.get(found["level"])) and not found.get(shown, {}).get("settings"):
         raise InputError(f"'{path}' says {found['level']}, and does not show its rates: record it anew.")
     return found if found["submission"] == submission else {}
 

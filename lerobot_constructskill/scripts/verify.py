@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from lerobot_constructskill.bounds import Count, Text, Workers, check
+from lerobot_constructskill.artifacts.pools import EXECUTORS
+from lerobot_constructskill.bounds import Among, Count, Text, Workers, check
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.scripts.console import command
 
@@ -24,6 +25,7 @@ class VerifyConfig:
     rerun: Path | None = None  # a submission from those starts: verify it too, and compare the two
     retrain: bool = False  # also make its policies again from its recipe, and compare; the same command continues
     made_in: Path = Path("outputs/retrained")  # where that is made; nothing else may have been made there
+    executor: Annotated[str, Among(EXECUTORS)] = "processes"  # where that is made: here, or on a Ray cluster
     allow_code: list[Text] = field(default_factory=list)  # DIST==VERSION of other packages whose code a recipe may run
 
     def __post_init__(self):
@@ -67,6 +69,7 @@ def verify(config: VerifyConfig) -> str:
     study = None
     if config.retrain:  # which alone looks at a recipe, and loads the policies of other packages
         from lerobot_constructskill.board.retrain import retrain, study_of
+        from lerobot_constructskill.study.spec import Options
 
         study = study_of(submission, config.allow_code)
     verdict = config.record and config.record / f"{config.root.resolve().name}.json"
@@ -82,8 +85,9 @@ def verify(config: VerifyConfig) -> str:
         told = f" Placed, on its own starts and on fresh ones: {describe(rates)}."
     replayed = replay_submission(submission, config.workers, config.sample)
     if study:
-        made = retrain(submission, study, config.made_in, config.workers or cores())
-        level, shown["retrained"] = RETRAINED, {"exact": not made.others, "settings": made.rates}
+        options = Options(workers=config.workers or cores(), executor=config.executor)
+        made = retrain(submission, study, config.made_in, options)
+        level, shown["retrained"] = RETRAINED, made.shown
         told = f" {made.told}"
     if verdict:
         record_verification(verdict, submission.sha256, level, **shown)

@@ -387,7 +387,8 @@ def an_address_that_is_a_script(root, rng):
 
 @forges(READ)
 def pictures_that_nobody_rendered(root, rng):
-    declare(root, lambda said: said.update(backend="physx_cpu, none rendering"))
+    shown = ["physx_cpu, none rendering", "physx_cpu, none rendering ", "physx_cpu", "physx_cpu,none rendering"]
+    declare(root, lambda said: said.update(backend=str(rng.choice([*shown, "physx_cpu, NONE rendering"]))))
 
 
 @forges(READ)

@@ -223,10 +223,17 @@ def test_a_verdict_is_of_one_submission_alone(many, tmp_path):
         write_board(root, tmp_path / "site")
         text = (tmp_path / "site" / "bins.html").read_text()
         assert f"{told}: block_to_bin 80% submitted, 70% again" in text and "other versions" in text
+        assert "starts from the weights" not in text
+    chosen = {"exact": True, "starts_from": f"ada/chosen@{'0a' * 20}"}
+    path.write_text(json.dumps(verdict | {"level": "retrained", "retrained": rates | chosen}))
+    write_board(root, tmp_path / "site")
+    assert "It starts from the weights ada/chosen@0a0a" in (tmp_path / "site" / "bins.html").read_text()
     value = {"value": f"1:{'ab' * 32}", "settings": {"block_to_bin": [0.8, 0.8]}}
     for wrong, why in (
         ({}, "does not show its rates"),
-        ({"rerun": {"value": "abc", "settings": {}}}, "must be a round of drand"),
+        ({"rerun": value | {"settings": {}}}, "does not show its rates"),
+        ({"level": "retrained", "retrained": {"exact": True, "settings": {}}}, "does not show its rates"),
+        ({"rerun": rates | {"value": "abc"}}, "must be a round of drand"),
         ({"rerun": {"settings": {}}}, "rerun.value: it is missing"),
         ({"rerun": value}, "needs a value of a later day"),
     ):

@@ -8,9 +8,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_constructskill.analysis.stats.comparisons import association
+from lerobot_constructskill.board import recovered
 from lerobot_constructskill.board.causes import GRASPED, cause
 from lerobot_constructskill.board.entries import read_entries
-from lerobot_constructskill.board.losses import Losses, by_setting, checked
+from lerobot_constructskill.board.losses import Losses, by_setting, checked, depends_on_seed
 from lerobot_constructskill.board.recovered import MEANING, Lost, Recovery, path_of, write_recovered
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.demos.state import PrivilegedState
@@ -94,12 +95,16 @@ def test_what_contradicts_bisection_is_counted():
 
 
 def test_what_depends_on_the_seed():
-    assert association([0] * 8 + [1] * 8, ["a"] * 8 + ["b"] * 8) < 0.01
-    assert association([0, 1] * 8, ["a", "a", "b", "b"] * 4) > 0.9
-    assert association([0, 0], ["a", "b"]) == association([0, 1], ["a", "a"]) == 1.0
+    assert association([0] * 8 + [1] * 8, ["a"] * 8 + ["b"] * 8, [0] * 16) < 0.01
+    assert association([0, 1] * 8, ["a", "a", "b", "b"] * 4, [0] * 16) > 0.9
+    assert association([0, 0], ["a", "b"], [0, 0]) == association([0, 1], ["a", "a"], [0, 0]) == 1.0
+    # One seed failed from the first start alone and the other from the second: the start may be the reason.
+    assert association([0] * 8 + [1] * 8, ["a"] * 8 + ["b"] * 8, [0] * 8 + [1] * 8) == 1.0
+    assert depends_on_seed(Losses([row(20)] * 9)) == "too few failures to tell"
+    assert depends_on_seed(Losses([row(20, seed=seed % 2) for seed in range(10)])) == "p = 1.00"
 
 
-def test_a_board_shows_what_is_known_of_this_submission_alone(valid, tmp_path):
+def test_a_board_shows_what_is_known_of_this_submission_alone(valid, tmp_path, monkeypatch):
     root = tmp_path / "board"
     shutil.copytree(valid, root / "entries" / "mine")
     sha256 = read_entries(root)[0][0].submission.sha256
@@ -109,12 +114,19 @@ def test_a_board_shows_what_is_known_of_this_submission_alone(valid, tmp_path):
         write_recovered(path, submission, [lost])
         write_board(root, tmp_path / "site")
         text = (tmp_path / "site" / "bins.html").read_text()
-        assert ("dropped 1" in text) == ("Until when failed episodes" in text) == is_shown
+        assert ("dropped 1" in text) == ("No failure of this page was drawn" in text) == is_shown
+        assert ("Not searched yet: " in text and "mine</a> (" in text) == (not is_shown)
+        assert "made by older code" not in text
         rows = pq.read_table(tmp_path / "site" / "board.parquet").to_pylist()
         known = [one["last_step_extra"] for one in rows if one["lost"] == "dropped"]
         assert known == [30] * is_shown
     (own,) = by_setting([lost]).values()
     assert own.phase == "carry 1"
+    monkeypatch.setattr(recovered, "VERSION", 0)
+    write_recovered(path, sha256, [lost])
+    monkeypatch.undo()
+    write_board(root, tmp_path / "site")
+    assert "made by older code" in " ".join((tmp_path / "site" / "bins.html").read_text().split())
     path.write_text("no table")
     assert read_entries(root)[1][0].startswith("Entry 'mine': ")
     with pytest.raises(InputError, match="is without what cannot be read"):

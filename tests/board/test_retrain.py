@@ -11,7 +11,7 @@ from commands import call
 from forge import declare, edit
 
 from lerobot_constructskill.board.declaration import Trained
-from lerobot_constructskill.board.recipe import check_plain
+from lerobot_constructskill.board.recipe import check_plain, starts_from
 from lerobot_constructskill.board.retrain import study_of
 from lerobot_constructskill.board.submission import RECIPE_FILE, read_submission, write_submission
 from lerobot_constructskill.errors import InputError
@@ -37,6 +37,12 @@ RECIPE = {
         ("pretrained_path", "ada/policy", "names no file, .*'ada/policy' without pretrained_revision, a commit"),
         ("backbone", "model.safetensors", "names no file"),
         ("dagger", "./rounds", "names no file"),
+        (
+            "backbone",
+            "hf/ada/encoder",
+            "by their commit, NAME@COMMIT: variants.ours.policy.backbone is 'hf/ada/encoder'",
+        ),
+        ("vlm_model_name", "ada/vlm", "by their commit"),
     ],
 )
 def test_a_recipe_is_plain_data(where, value, said):
@@ -54,6 +60,8 @@ def test_weights_of_one_commit_on_the_hub_are_plain_data():
     policy = recipe["variants"]["ours"]["policy"]
     policy |= {"pretrained_path": "lerobot/smolvla_base", "pretrained_revision": "0a" * 20}
     check_plain(recipe)
+    assert starts_from(recipe) == f"lerobot/smolvla_base@{'0a' * 20}" and not starts_from(RECIPE)
+    check_plain(json.loads(json.dumps(RECIPE).replace("efficientnet_lite0", "hf/ada/encoder@0a0a0a")))
     for changed in (
         {"pretrained_path": "../smolvla_base"},
         {"pretrained_path": "a/b/c"},

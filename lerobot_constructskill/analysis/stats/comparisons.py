@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import quad
-from scipy.stats import PermutationMethod, beta, boschloo_exact, chi2_contingency, fisher_exact, permutation_test
-from scipy.stats.contingency import crosstab
+from scipy.stats import beta, boschloo_exact, fisher_exact, permutation_test
+from scipy.stats.contingency import crosstab, expected_freq
 from statsmodels.stats.multitest import multipletests
 
 from lerobot_constructskill.analysis.stats.intervals import Estimate, mean_rate, newcombe
@@ -198,14 +198,26 @@ def _table(a: Counts, b: Counts) -> list[list[int]]:
     return [[a.met, b.met], [a.seeds - a.met, b.seeds - b.met]]
 
 
-def association(groups: Sequence, kinds: Sequence) -> float:
+def association(groups: Sequence, kinds: Sequence, strata: Sequence) -> float:
     """P-value of a permutation test whether what kind something is depends on its group, by the chi-squared statistic.
 
     Args:
         groups, kinds: of each thing; of one group or one kind alone, nothing can depend.
+        strata: of each thing; kinds are exchanged within one alone, because things of one stratum are more alike.
     """
     counts = crosstab(groups, kinds).count
     if 1 in counts.shape:
         return 1.0
-    method = PermutationMethod(n_resamples=PERMUTATIONS, rng=np.random.default_rng(0))
-    return float(chi2_contingency(counts, correction=False, method=method).pvalue)
+    expected = expected_freq(counts)
+    of_group, of_kind, of_stratum = (np.unique(one, return_inverse=True)[1] for one in (groups, kinds, strata))
+    in_order, rng = np.argsort(of_stratum, kind="stable"), np.random.default_rng(0)
+
+    def statistic(kinds: np.ndarray) -> float:
+        found = np.bincount(of_group * counts.shape[1] + kinds, minlength=counts.size).reshape(counts.shape)
+        return float((np.square(found - expected) / expected).sum())
+
+    exchanged, as_large, seen = np.empty_like(of_kind), 0, statistic(of_kind)
+    for _ in range(PERMUTATIONS):
+        exchanged[in_order] = of_kind[np.lexsort((rng.random(len(of_kind)), of_stratum))]
+        as_large += statistic(exchanged) >= seen - 1e-9
+    return (1 + as_large) / (1 + PERMUTATIONS)
