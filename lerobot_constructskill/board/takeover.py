@@ -28,8 +28,8 @@ STILL = 0.0005
 EVERY = 10
 """Steps between two attempts in an episode that is drawn to check the search."""
 
-LONGEST_S = 600
-"""Seconds after which a copy that has not answered counts as dead."""
+LONGEST_S = 3600
+"""Seconds after which a copy that has not answered hangs: every tenth step of a wall of 2,000 takes minutes."""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,7 @@ def read_verification(path: Path, submission: str) -> dict[str, Any]:
     """
     if not os.path.lexists(path):
         return {}
-    found = {"machines": []} | VERIFICATION.read(path)
+    found: dict[str, Any] = {"machines": [], **VERIFICATION.read(path)}
     if (shown := RATES_OF.get(found["level"])) and not found.get(shown, {}).get("settings"):
         raise InputError(f"'{path}' says {found['level']}, and does not show its rates: record it anew.")
     return found if found["submission"] == submission else {}
