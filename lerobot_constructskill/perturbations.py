@@ -96,7 +96,10 @@ class Perturbation:
     def check(self, task: Task) -> None:
         """Raise InputError where another size is asked of a task without a brick, or other words that it lacks."""
         if self.amount("size") and not task.is_brick:
-            raise InputError(f"The axis 'size' is EN 771-1's tolerance of bricks; {task.name} has no brick.")
+            raise InputError(
+                f"The axis 'size' is EN 771-1's tolerance of a task's one brick; {task.name} has no brick, "
+                "or bricks with sizes of their own."
+            )
         if self.amount("language") >= max(1, len(task.rewordings)):
             raise InputError(f"The row of {task.name} has no rewordings of level {self._level('language')}.")
 

@@ -172,6 +172,8 @@ def _unlike(submission: Submission, trained: Trained, table: Table) -> Iterator[
                 is_same = claim.error if again is None else np.array_equal(claim.flat, again.flat)
                 if not is_same:
                     yield f"{where} acts otherwise from start {claim.evaluation_seed}"
+                elif again and (again.lifted, again.placed) != (claim.lifted, claim.placed):
+                    yield f"{where} ends otherwise from start {claim.evaluation_seed}"
 
 
 def _rates(

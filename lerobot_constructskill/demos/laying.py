@@ -5,11 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_constructskill.contract import ROBOT_BASE
+from lerobot_constructskill.demos.pick_place import NEAREST
 from lerobot_constructskill.demos.precise import PreciseExpert
 from lerobot_constructskill.demos.state import PrivilegedState
 
 FULL_LEVER = 0.65
 """Distance in metres from the robot's base at which `ExpertConfig.compliance` was measured."""
+
+ROUND = 0.32
+"""Distance in metres at which the hand goes round the robot's base."""
 
 TOUCHING = 0.002
 """Height in metres over the floor from which down an element's lowest corner carries a part of its weight."""
@@ -21,6 +25,17 @@ class LayingExpert(PreciseExpert):
 
     release_gap = 0.002
     _clear_height = 0.10
+
+    def _way(self, error: np.ndarray, state: PrivilegedState) -> np.ndarray:
+        """Round the robot's base where the straight way leads too near it, as to an element that waits beside it."""
+        here, ahead = (state.tcp - ROBOT_BASE)[:2], error[:2]
+        passed = float(np.clip(-(here @ ahead) / max(ahead @ ahead, 1e-9), 0, 1))
+        closest = here + passed * ahead
+        distance = float(np.linalg.norm(closest))
+        if passed in (0.0, 1.0) or distance > NEAREST:
+            return error
+        outward = closest / distance if closest[0] > 0 else np.array([1.0, 0.0])  # never behind the robot
+        return np.array([*(outward * ROUND - here), error[2]])
 
     def _underside(self, state: PrivilegedState) -> float:
         """Height of the middle of the underside in metres.

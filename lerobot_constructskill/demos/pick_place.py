@@ -79,9 +79,13 @@ class PickPlaceExpert:
         if progress.phase in (Phase.GRASP, Phase.RELEASE):
             return np.zeros(3)
         if progress.phase in (Phase.LIFT, Phase.CARRY):
-            moved = self._toward(self._error(state, progress), self.config.load_max_step)
+            moved = self._toward(self._way(self._error(state, progress), state), self.config.load_max_step)
             return moved + self._weight_compensation(state)
-        return self._toward(self._waypoint(state, progress) - state.tcp, self.config.max_step)
+        return self._toward(self._way(self._waypoint(state, progress) - state.tcp, state), self.config.max_step)
+
+    def _way(self, error: np.ndarray, state: PrivilegedState) -> np.ndarray:
+        """Which way to go to end an error, (3,) metres: straight."""
+        return error
 
     def _weight_compensation(self, state: PrivilegedState) -> np.ndarray:
         return np.array([0, 0, self.config.compliance * (GRAVITY * state.object_mass[0])])

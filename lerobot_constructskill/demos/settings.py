@@ -27,6 +27,9 @@ from lerobot_constructskill.plans.plan import read_plan
 
 LABELS = ("clean", "executed", "advice")
 
+STEPS_AN_ELEMENT = 250
+"""Steps in which the expert lays an element of a plan, about."""
+
 FRAME_PACKAGES = ("lerobot", "mani_skill", "sapien", "torch", "numpy", "av")
 """Packages whose versions may show in the frames."""
 
@@ -91,12 +94,25 @@ class GenerateConfig:
 
     def __post_init__(self):
         check(self)
-        list_tasks(self.task, self.action)
+        self._check_plans(list_tasks(self.task, self.action))
         if self.cameras is not None and not (self.cameras and {*self.cameras} <= {*OBS_TYPES[self.obs_type]}):
             raise InputError(
                 f"cameras must be some of {', '.join(OBS_TYPES[self.obs_type])}, which {self.obs_type} has, not "
                 f"{', '.join(self.cameras) or 'none'}."
             )
+
+    def _check_plans(self, rows: list[Task]) -> None:
+        """Refuse plans that take longer than an attempt, and two that one sentence asks for."""
+        for row in rows:
+            elements = len(read_plan(row.plan).elements) if row.plan else 0
+            if self.max_steps < elements * STEPS_AN_ELEMENT:
+                raise InputError(
+                    f"{row.name} has {elements} elements, of which each takes about {STEPS_AN_ELEMENT} steps: give "
+                    f"max_steps={elements * (STEPS_AN_ELEMENT + 100)}, not {self.max_steps}."
+                )
+        asked = [row.instruction for row in rows if row.plan]
+        if twice := next((one for one in asked if asked.count(one) > 1), None):
+            raise InputError(f"Two plans of {self.task} are asked for by one sentence, {twice!r}: make a set of each.")
 
     @property
     def rows(self) -> list[Task]:

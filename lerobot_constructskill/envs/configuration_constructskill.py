@@ -71,6 +71,8 @@ class ConstructSkillEnvConfig(EnvConfig):
         with as_field_error():
             check(self)
             if self.plan is not None:
+                if self.task not in (type(self).task, f"{PLANNED}{self.plan}"):
+                    raise InputError(f"The plan {self.plan} is a task of its own: leave out --env.task={self.task}.")
                 self.task = f"{PLANNED}{self.plan}"
             if self.max_parallel_tasks != 1:
                 raise InputError("max_parallel_tasks must be 1: LeRobot's threads would share one stateful policy.")

@@ -5,13 +5,19 @@ from math import hypot
 
 from lerobot_constructskill.contract import ROBOT_BASE, highest_tcp
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.plans.plan import Kind, Plan, Position, supplies
+from lerobot_constructskill.plans.plan import Element, Kind, Plan, Position, supplies
 
 NEAREST, FARTHEST = 0.30, 0.76
 """Horizontal distances in metres from the robot's base between which the hand lays with its fingers down."""
 
 CARRIED_OVER, HELD_BELOW = 0.04, 0.03
 """Height in metres at which an element is carried over all others, and of the TCP below an element's top."""
+
+HIGHEST = 0.42
+"""Height in metres of an element's top up to which the hand lays: a fifth brick on four was held and never let go."""
+
+WRIST_ABOVE, WRIST_LENGTH, WRIST_WIDTH = 0.15, 0.16, 0.12
+"""In metres: the wrist's underside over the TCP, how far it reaches from there toward the robot, and its width."""
 
 JAWS, FINGER_WIDTH, TIPS = 0.062, 0.022, 0.012
 """In metres: from the TCP along the jaws to the outside of an open finger, a finger's width, and its tip below it."""
@@ -21,6 +27,9 @@ CLOSE = 0.0005
 
 LEANING = 0.006
 """Largest planned difference in metres between the heights of what carries one element."""
+
+WAITS_WITHIN = 0.03
+"""Metres in x and in y by which an element may wait off its place (`sim.tasks.wall`)."""
 
 APART = 0.12
 """Distance in metres across the wall that an element keeps from those that wait."""
@@ -45,11 +54,12 @@ def check_plan(plan: Plan) -> None:
 def complaints(plan: Plan) -> Iterator[str]:
     """Sentences about what cannot be built, in the order of laying."""
     laid: list[Box] = []
+    yield from _of_waiting(plan)
     for box in zip(plan.elements, plan.drawn, plan.kinds, strict=True):
         yield from _of_reach(*box, laid, plan)
         yield from _of_support(*box, [other for other in laid if other[0] in plan.elements[box[0]].on])
         for other in laid:
-            yield from _of_earlier(*box, *other)
+            yield from _of_earlier(*box, *other, plan.elements[box[0]])
         laid.append(box)
 
 
@@ -69,12 +79,43 @@ def _of_reach(name: str, place: Position, kind: Kind, laid: list[Box], plan: Pla
             f"The element '{name}' has to be carried {carried:.2f} m high over what is laid before it; {away:.2f} m "
             f"from its base the arm reaches {highest:.2f} m."
         )
+    if (top := place[2] + kind.size[2] / 2) > HIGHEST:
+        yield f"The top of the element '{name}' lies {top:.2f} m high; the hand lays up to {HIGHEST} m."
+    for other, middle, one in laid:
+        if middle[2] + one.size[2] / 2 > top - HELD_BELOW + WRIST_ABOVE and _is_under_wrist(place, middle, one):
+            yield f"There is no room for the arm at '{name}' behind '{other}', which is higher: lay '{name}' first."
     for start, one in zip(supplies(plan), plan.kinds, strict=True):
         beside = abs(place[1] - start[1]) - (kind.size[1] + one.size[1]) / 2
         along = abs(place[0] - start[0]) - (kind.size[0] + one.size[0]) / 2
         if max(beside, along) < APART:
             yield f"The element '{name}' lies where elements wait, on the side of the robot where y is above 0."
             return
+
+
+def _is_under_wrist(place: Position, middle: Position, kind: Kind) -> bool:
+    """Whether an element lies between where the hand is and the robot, so near that the wrist would be in it."""
+    toward = [ROBOT_BASE[axis] - place[axis] for axis in (0, 1)]
+    away = hypot(*toward)
+    for step in range(5):
+        point = [place[axis] + toward[axis] / away * WRIST_LENGTH * step / 4 for axis in (0, 1)]
+        if all(abs(point[axis] - middle[axis]) < (kind.size[axis] + WRIST_WIDTH) / 2 for axis in (0, 1)):
+            return True
+    return False
+
+
+def _of_waiting(plan: Plan) -> Iterator[str]:
+    """Elements that may stand in each other before the first is laid."""
+    waiting = list(zip(plan.elements, supplies(plan), plan.kinds, strict=True))
+    for number, (name, place, kind) in enumerate(waiting):
+        for other, its_place, its_kind in waiting[:number]:
+            gaps = [
+                abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in (0, 1)
+            ]
+            if max(gaps) < 2 * WAITS_WITHIN:
+                yield (
+                    f"The elements '{other}' and '{name}' would wait in each other: their places in the order of "
+                    "laying are next to each other, and both are too long."
+                )
 
 
 def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterator[str]:
@@ -101,13 +142,26 @@ def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterat
 
 
 def _of_earlier(
-    name: str, place: Position, kind: Kind, other: str, its_place: Position, its_kind: Kind
+    name: str,
+    place: Position,
+    kind: Kind,
+    other: str,
+    its_place: Position,
+    its_kind: Kind,
+    element: Element,
 ) -> Iterator[str]:
     """What stands between an element and one that is laid before it."""
     gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
     if max(gaps) < -CLOSE:
         yield f"The elements '{other}' and '{name}' are in one place."
         return
+    if max(gaps) > -CLOSE and gaps[2] < -CLOSE and gaps[1] < -CLOSE and not element.beside:
+        varies = (kind.deviations[0] + its_kind.deviations[0]) / 2
+        if gaps[0] < varies:
+            yield (
+                f"The elements '{other}' and '{name}' are {1000 * max(gaps[0], 0):.1f} mm apart, and their lengths "
+                f"vary by {1000 * varies:.1f} mm together: lay '{name}' beside '{other}', or farther away."
+            )
     if max(gaps[:2]) < -CLOSE and its_place[2] > place[2]:
         yield f"The element '{name}' lies below '{other}', which is laid before it."
         return

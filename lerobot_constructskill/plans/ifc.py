@@ -1,20 +1,28 @@
 """Makes a plan of an IFC file: every building element whose box is one of `KINDS` is laid where the model has it."""
 
-from collections.abc import Iterator
+import logging
+import re
+import unicodedata
+from collections.abc import Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.errors import InputError, MissingError, remedy_of
+from lerobot_constructskill.errors import InputError, MissingError, plural, remedy_of
 from lerobot_constructskill.plans.plan import KINDS, PLAN, Plan, written
+
+logger = logging.getLogger(__name__)
 
 SAME = 0.006
 """Metres by which an element's edges may differ from those of its kind."""
 
 TOUCHES = 0.006
 """Largest height in metres between an element's underside and the top of what carries it."""
+
+LONGEST = 40
+"""Letters of an element's name."""
 
 MOST = 64 << 20
 """Bytes that a file may have."""
@@ -82,6 +90,7 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         raise InputError(f"'{path}' is not an IFC file ({' '.join(str(error).split())[:100]}).") from None
     settings = ifcopenshell.geom.settings()
     taken: set[str] = set()
+    left_out: list[str] = []
     for part in parts:
         if part.Representation is None:
             continue
@@ -96,12 +105,23 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         corners = corners @ matrix[:3, :3].T + matrix[:3, 3]
         size, middle = np.ptp(corners, axis=0), (corners.max(axis=0) + corners.min(axis=0)) / 2
         kind = next((name for name, one in KINDS.items() if (abs(size - one.size) < SAME).all()), None)
-        if kind is not None:
-            name = "".join(letter if letter.isalnum() else "_" for letter in (part.Name or kind)).strip("_") or kind
+        if kind is None:
+            left_out.append(f"'{part.Name}' ({_millimetres(size)})")
+        else:
+            plain = unicodedata.normalize("NFKD", part.Name or kind).encode("ascii", "ignore").decode()
+            name = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:LONGEST] or kind
             free = next(one for one in chain([name], (f"{name}_{n}" for n in count(2))) if one not in taken)
             taken.add(free)
             yield free, kind, middle, size
+    if left_out:
+        logger.warning(
+            "%s of '%s' left out, of no known kind and size: %s%s",
+            plural(len(left_out), "element"),
+            path,
+            ", ".join(left_out[:3]),
+            ", ..." * (len(left_out) > 3),
+        )
 
 
-def _millimetres(size: tuple[float, ...]) -> str:
-    return " x ".join(f"{1000 * edge:g}" for edge in size) + " mm"
+def _millimetres(size: Sequence[float]) -> str:
+    return " x ".join(f"{1000 * edge:.0f}" for edge in size) + " mm"

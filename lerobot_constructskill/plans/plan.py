@@ -114,6 +114,8 @@ class Plan:
             )
         if element.at is not None and len(element.at) != 2:
             raise InputError(f"The element '{name}' has at {element.at}, which must be x and y in metres.")
+        if twice := next((other for other in element.on if element.on.count(other) > 1), None):
+            raise InputError(f"The element '{name}' names '{twice}' twice in `on`.")
         for other in element.references:
             if other not in self.elements:
                 raise InputError(f"The element '{name}' names '{other}', which is not in the plan.")
@@ -214,7 +216,7 @@ SUPPLIES = (
     (-0.30, 0.57),
     (-0.58, 0.40),
     (-0.58, 0.57),
-    (-0.86, 0.48),
+    (-0.30, 0.06),
 )
 """x and y in metres of the places where elements wait, on the other side of the robot than walls."""
 

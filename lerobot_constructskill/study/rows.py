@@ -225,6 +225,8 @@ class Row(EpisodeRow):
         setting: the study's setting.
         variant: the study's variant, or a reference such as "no_op".
         role: `VARIANT`, `REFERENCE` or `SIGHTLESS`.
+        task: a name in `contract.TASKS`, or a plan; null in older rows, and so is the next one.
+        instruction: the sentence that the policy was told.
         episodes: how many evaluation episodes the run has, or is to have.
         demonstrations: name of the data set that it was trained on; null for a reference that uses none.
         heldout_mse_m2: the run's translation error on the setting's held-out demonstrations, in m2.
@@ -236,6 +238,8 @@ class Row(EpisodeRow):
     variant: str
     role: str
     episodes: int
+    task: str | None = None
+    instruction: str | None = None
     demonstrations: str | None = None
     heldout_mse_m2: float | None = None
     heldout_mse_m2_by_data: str | None = None
@@ -248,7 +252,7 @@ TABLES = {
         "a table of a study's rows",
         Row,
         json={"versions": VERSIONS, "heldout_mse_m2_by_data": ERRORS},
-        added=MEASURED,
+        added=(*MEASURED, "task", "instruction"),
     ),
 }
 

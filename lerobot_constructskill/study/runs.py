@@ -24,6 +24,7 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
+from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import FirstEpisode, Rollout, roll_out
 from lerobot_constructskill.rollout.references import REFERENCES
@@ -86,6 +87,12 @@ class Arm:
     def id(self) -> str:
         return f"{self.setting}/{self.name}"
 
+    @property
+    def place(self) -> dict[str, Any]:
+        """Where its episodes take place: the environment, and what stands in the plan that it names."""
+        plan = get_task(self.env["task"]).plan
+        return self.env | ({"plan": read_plan(plan).facts()} if plan else {})
+
 
 @dataclass(frozen=True, eq=False)
 class Run(Node):
@@ -103,7 +110,7 @@ class Run(Node):
     def facts(self) -> dict[str, Any]:
         reference = {} if self.arm.learner else {"reference": self.arm.name}
         evaluation = {"seed": self.arm.starts.start, "episodes": len(self.arm.starts)}
-        return {**reference, "seed": self.seed, "environment": self.arm.env, "evaluation": evaluation}
+        return {**reference, "seed": self.seed, "environment": self.arm.place, "evaluation": evaluation}
 
     def versions(self) -> dict[str, str]:
         task = get_task(self.arm.env["task"])
@@ -287,7 +294,7 @@ def _row(job: Job, run: Run, backend: str | None = None) -> EpisodeRow:
         episode=0,
         dataset_sha256=_dataset_sha256(job, run),
         weights_sha256=weights,
-        environment_sha256=digest({"environment": arm.env, "backend": backend}),
+        environment_sha256=digest({"environment": arm.place, "backend": backend}),
         backend=backend,
         versions=json.dumps(run.spec["versions"] | stands_on | _made_on(run, backend)),
     )

@@ -14,6 +14,7 @@ from typing import Any
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import Store
+from lerobot_constructskill.envs.gym_env import perturbed_task
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
 from lerobot_constructskill.study.runs import EPISODES, FILMED_SEED, VIDEO, Run
@@ -170,10 +171,13 @@ def _keys(run: Run) -> list[tuple[str, str, str]]:
 
 def _names(run: Run) -> dict[str, Any]:
     arm = run.arm
+    task, perturbation = perturbed_task(arm.env["task"], arm.env["perturb"], arm.env["perturb_seed"])
     return {
         "setting": arm.setting,
         "variant": arm.name,
         "role": arm.role,
         "episodes": len(arm.starts),
+        "task": arm.env["task"],
+        "instruction": perturbation.told(task).instruction,
         "demonstrations": arm.demonstrations and arm.demonstrations.name,
     }

@@ -12,6 +12,7 @@ from forge import declare, edit
 
 from lerobot_constructskill.board.declaration import Trained
 from lerobot_constructskill.board.recipe import check_plain, starts_from
+from lerobot_constructskill.board.recovered import Lost, path_of, read_recovered
 from lerobot_constructskill.board.retrain import study_of
 from lerobot_constructskill.board.submission import RECIPE_FILE, read_submission, write_submission
 from lerobot_constructskill.errors import InputError
@@ -124,6 +125,12 @@ def test_an_honest_entry_is_the_same_and_a_forged_one_is_told(made, tmp_path):
     verdict = json.loads((made / "verified" / "study_entry.json").read_text())
     assert verdict["level"] == "retrained"
     assert verdict["retrained"] == {"exact": True, "settings": {"fixed": [0.0, 0.0]}}
+
+    submission = read_submission(shutil.copytree(entry, tmp_path / "board" / "entries" / "mine"))
+    call("constructskill-recover", f"--root={tmp_path / 'board'}")
+    recovered = read_recovered(path_of(tmp_path / "board", "mine"), submission.sha256).values()
+    assert {row.key for row in recovered} == {claim.key for claim in submission.claims if not claim.placed}
+    assert Lost.UNSEEN not in {row.lost for row in recovered}, "replay, recovery and retraining agree"
 
     another_number = shutil.copytree(entry, tmp_path / "number")
     recipe = yaml.safe_load((another_number / RECIPE_FILE).read_text())

@@ -1,6 +1,7 @@
 """Plans: what is read, refused, drawn, measured, and made of an IFC file."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from commands import call
 
 from lerobot_constructskill.contract import MAX_PLACEMENTS, SHIPPED, SIM_STATE, get_task
+from lerobot_constructskill.demos.settings import GenerateConfig
 from lerobot_constructskill.errors import InputError, MissingError
 from lerobot_constructskill.plans.check import check_plan, complaints
 from lerobot_constructskill.plans.ifc import plan_of
@@ -64,6 +66,7 @@ def test_what_stands_on_one_or_on_even_supports_stands_on_their_tops():
         ({"a": FLAT["a"] | {"beside": "b"}, "b": FLAT["a"]}, "'a' needs one place"),
         ({"a": {"kind": "brick", "beside": "b"}, "b": {"kind": "brick", "beside": "a"}}, "'a' names 'b'.*laid before"),
         ({"a": {"kind": "brick", "beside": "z"}}, "'a' names 'z', which is not in the plan"),
+        ({"a": FLAT["a"], "b": {"kind": "brick", "on": ["a", "a"]}}, "'b' names 'a' twice in `on`"),
     ],
     ids=str,
 )
@@ -102,6 +105,24 @@ def test_a_low_element_below_one_that_lies_already_is_refused():
     assert any("'d' lies below 'c'" in one for one in complaints(read))
 
 
+def test_what_the_arm_or_the_sizes_leave_no_room_for_is_refused():
+    brick = {"kind": "brick"}
+    tower = {"a": FLAT["a"]} | {name: brick | {"on": [below]} for below, name in pairwise("abcde")}
+    assert [*complaints(plan(**tower))] == ["The top of the element 'e' lies 0.50 m high; the hand lays up to 0.42 m."]
+    behind = dict(list(tower.items())[:3]) | {"low": {"kind": "post", "at": [-0.40, -0.43]}}
+    assert [*complaints(plan(**behind))] == [
+        "There is no room for the arm at 'low' behind 'c', which is higher: lay 'low' first."
+    ]
+    assert not [*complaints(plan(low=behind.pop("low"), **behind))]
+    touching = plan(a=FLAT["a"], b=brick | {"at": [FLAT["a"]["at"][0] + BRICK[0], FLAT["a"]["at"][1]]})
+    assert "'a' and 'b' are 0.0 mm apart, and their lengths vary by 3.6 mm together" in "".join(complaints(touching))
+    assert not [*complaints(plan(a=FLAT["a"], b=brick | {"beside": "a", "joint": 0.0}))], "it is laid where 'a' ends"
+    beams = plan(
+        **{name: {"kind": "beam", "at": [-0.25, y]} for name, y in {"a": -0.2, "b": -0.35, "c": -0.5}.items()}
+    )
+    assert "'b' and 'c' would wait in each other" in "".join(complaints(beams))
+
+
 def test_elements_that_wait_leave_the_fingers_room():
     assert len(SUPPLIES) == MAX_PLACEMENTS
     for number, (x, y) in enumerate(SUPPLIES):
@@ -129,6 +150,15 @@ def test_a_wall_is_measured_as_a_mason_does():
     begun = measure(read, state(read, np.zeros((3, 3)), [1, 0, 0]))
     assert (begun["length"], begun["level"], begun["line"]) == (None, None, 0.0)
     json.dumps(laid)
+
+
+def test_a_set_of_plans_has_the_steps_and_the_sentences_that_it_needs():
+    for task in ("bond_of_five", "plan:bond_of_five"):
+        with pytest.raises(InputError, match="has 5 elements, .* give max_steps=1750, not 1000"):
+            GenerateConfig("local/x", task=task)
+    with pytest.raises(InputError, match="asked for by one sentence, 'Build the wall after its plan.'"):
+        GenerateConfig("local/x", task="plan:course_of_three,plan:lintel_on_posts")
+    GenerateConfig("local/x", task="wall", max_steps=2000)
 
 
 def test_any_plan_is_a_task_of_every_command():
@@ -209,6 +239,13 @@ def test_an_ifc_file_becomes_a_plan_that_can_be_built(tmp_path):
     np.testing.assert_allclose(
         read.drawn, [[-0.4, -0.25, 0.05], [-0.18, -0.25, 0.05], [-0.29, -0.25, 0.15]], atol=1e-4
     )
+
+
+def test_what_is_left_out_of_an_ifc_file_is_told_and_names_may_be_of_any_language(tmp_path, caplog):
+    pytest.importorskip("ifcopenshell", reason="extra bim")
+    boxes = [("Stürz 1", *WALL[2][1:]), ("x" * 120, *WALL[1][1:]), ("half", (0.1, *BRICK[1:]), (9.3, 4.75, 0.05))]
+    assert [*plan_of(ifc_of(tmp_path / "wall.ifc", boxes), (-0.4, -0.25))["elements"]] == ["Sturz_1", "x" * 40]
+    assert "1 element of" in caplog.text and "left out" in caplog.text and "'half' (100 x 65 x 100 mm)" in caplog.text
 
 
 def test_no_element_of_an_ifc_file_takes_the_name_of_another(tmp_path):

@@ -22,6 +22,7 @@ from lerobot_constructskill.artifacts.revisions import BEFORE
 from lerobot_constructskill.artifacts.store import LOG, Machine, Store
 from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.errors import InputError, MachineError, UserError, kind_of
+from lerobot_constructskill.plans.plan import written
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
 from lerobot_constructskill.scripts.study import StudyConfig
@@ -219,6 +220,21 @@ def test_seeds_of_a_draw_share_its_demonstrations_and_starts_and_no_other_draw_h
     for fields in ({"starts": "own"}, {"seeds_a_draw": 2}):
         with pytest.raises(InputError, match="they need `demonstrations: own`"):
             study(**fields)
+
+
+def test_a_run_depends_on_what_stands_in_its_plan_and_its_row_says_what_was_asked(tmp_path):
+    """A file that is edited keeps its name."""
+    file, digests = tmp_path / "wall.yaml", set()
+    for joint in (0.010, 0.020):
+        elements = {"a": {"kind": "brick", "at": [-0.4, -0.25]}, "b": {"kind": "brick", "beside": "a", "joint": joint}}
+        file.write_text(written({"elements": elements}))
+        settings = {"wall": Setting(f"smoke --task=plan:{file}", ENV | {"task": f"plan:{file}"})}
+        runs = list_runs(study(settings=settings, variants={"a": Variant(ACT, seeds=1)}, references={"no_op": 1}))
+        digests |= {run.digest for run in runs}
+    assert len(digests) == 4, "of a policy and of a reference"
+    Table(tmp_path, runs, Store(tmp_path / "store")).write()
+    asked = {(row.task, row.instruction) for row in load_rows(tmp_path / ROWS)}
+    assert asked == {(f"plan:{file}", "Build the wall after its plan.")}
 
 
 def test_each_run_is_evaluated_from_its_own_draws_starts(tmp_path, monkeypatch):
