@@ -26,7 +26,7 @@ LADDER_DEPTH = 0.05
 """Depth of the ladder's bins in metres; the tips of the fingers end 0.039 m below the top of the 0.10 m high brick."""
 
 TOLERANCE = 0.005
-"""Metres that the upper brick may stand off the lower one's edges: NHBC's 1.2-S1 allows a joint 5 mm off the mean."""
+"""Metres that the upper brick may stand off the lower one's edges, as NHBC's 1.2-S1(b) lets a bed joint be off."""
 
 
 @register_env(TASKS["brick_to_bin"].env_id, max_episode_steps=TASKS["brick_to_bin"].horizon)
