@@ -1,7 +1,7 @@
 """Measures a laid wall as a mason does: every element against its place, and the courses in length, level and line."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_constructskill.plans.plan import Plan
 
 SAME_COURSE = 0.02
-"""Difference in planned height, in metres, up to which elements are of one course."""
+"""Difference in planned height and across the wall, in metres, up to which elements of one kind are of one course."""
 
 
 def measure(plan: Plan, sim: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def measure(plan: Plan, sim: Mapping[str, np.ndarray]) -> dict[str, Any]:
     turns = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     errors = np.column_stack([1000 * (poses[:, :3] - resting), np.degrees(tilts), np.degrees(turns)])
     tops = poses[:, 2] + sizes[:, 2] / 2
-    courses = [abs(drawn[:, 2] - height) < SAME_COURSE for height in np.unique(drawn[:, 2].round(3))]
+    courses = list(_courses(plan, drawn))
     whole = [course for course in courses if is_placed[course].all() and course.sum() > 1]
     nominal = np.array([kind.size for kind in plan.kinds])
     lengths = [(_length(drawn[one], nominal[one]), _length(poses[one], sizes[one])) for one in whole]
@@ -48,6 +48,16 @@ def measure(plan: Plan, sim: Mapping[str, np.ndarray]) -> dict[str, Any]:
         "level": round(1000 * float(max(levels)), 2) if levels else None,
         "line": round(1000 * float(lines.max()), 2) if len(lines) else None,
     }
+
+
+def _courses(plan: Plan, drawn: np.ndarray) -> Iterator[np.ndarray]:
+    """Which elements are of each course, (elements,) bool."""
+    kinds, seen = np.array([element.kind for element in plan.elements.values()]), np.zeros(len(drawn), dtype=bool)
+    for number, middle in enumerate(drawn):
+        if not seen[number]:
+            course = (abs(drawn - middle)[:, 1:] < SAME_COURSE).all(axis=1) & (kinds == kinds[number])
+            seen |= course
+            yield course
 
 
 def _length(middles: np.ndarray, sizes: np.ndarray) -> float:

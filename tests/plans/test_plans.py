@@ -152,6 +152,14 @@ def test_a_wall_is_measured_as_a_mason_does():
     json.dumps(laid)
 
 
+def test_a_course_is_of_one_kind_on_one_line():
+    read = plan(a=FLAT["a"], post={"kind": "post", "at": [-0.1, -0.25]}, far={"kind": "brick", "at": [-0.4, -0.45]})
+    told = measure(read, state(read, np.zeros(3), 1))
+    assert (told["level"], told["length"], told["line"]) == (None, None, 0.0)
+    two = plan(**FLAT, c={"kind": "brick", "at": [-0.4, -0.45]})
+    assert measure(two, state(two, np.array([[0, 0, 0], [0, 0, 0.002], [0, 0, 0.009]]), 1))["level"] == 2.0
+
+
 def test_a_set_of_plans_has_the_steps_and_the_sentences_that_it_needs():
     for task in ("bond_of_five", "plan:bond_of_five"):
         with pytest.raises(InputError, match="has 5 elements, .* give max_steps=1750, not 1000"):
