@@ -69,7 +69,7 @@ def _stacked(claims: Sequence[Episode], longest: int) -> tuple[np.ndarray, np.nd
     last = first.copy()
     for number, claim in enumerate(claims):
         executed = within_reach(claim.executed, get_task(claim.task, claim.action).action_names)
-        executed[:, -1] = np.sign(executed[:, -1])  # the jaws open or close, whatever is asked between
+        executed[:, -1] = 0  # jaws that hold close no further, whatever is asked: it would hide a copy
         first[number, : claim.steps] = last[number, longest - claim.steps :] = executed
     return first, last
 

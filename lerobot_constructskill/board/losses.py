@@ -85,8 +85,12 @@ def by_seed(losses: Losses) -> dict[int, Losses]:
 
 def depends_on_seed(losses: Losses) -> str:
     """Whether what was lost depends on the training seed: the p-value of a permutation of episodes from one start."""
-    if len(losses.rows) < FEWEST:
-        return "too few failures to tell"
+    strata = _grouped(losses.rows, lambda row: row.evaluation_seed).values()
+    can_differ = any(
+        len({row.training_seed for row in one.rows}) > 1 < len({row.lost for row in one.rows}) for one in strata
+    )
+    if len(losses.rows) < FEWEST or not can_differ:
+        return "cannot be told from these failures"
     of_each = ([getattr(row, name) for row in losses.rows] for name in ("training_seed", "lost", "evaluation_seed"))
     return f"p = {p_value(association(*of_each))}"
 

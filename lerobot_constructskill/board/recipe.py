@@ -27,10 +27,10 @@ RECIPE = Yaml("a recipe, the fields of a study", dict[str, Any])
 A_PATH = re.compile(r"[/~.\\]|.*(\.\.|\\)|.*\.(ya?ml|json|safetensors|ckpt|bin|pth?|py|parquet)$")
 """Text that names a file, from its beginning on."""
 
-UNPINNED = re.compile(r"(hf/)?[\w-][\w.-]*/[\w-][\w.-]*")
-"""Weights on the Hub of no commit: they may be others tomorrow."""
-
 ON_THE_HUB, COMMIT = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*"), re.compile("[0-9a-f]{40}")
+
+NAMED = re.compile(rf"(hf/)?{ON_THE_HUB.pattern}(@.*)?")
+"""Weights on the Hub, as a field of a policy names them; without a commit they may be others tomorrow."""
 
 
 def recipe_of(root: Path, variant: str, settings: Mapping[str, str]) -> str:
@@ -81,7 +81,7 @@ def check_plain(values: Mapping[str, Any]) -> None:
         if field.endswith("path"):
             also = " without pretrained_revision, a commit on the Hub" * (field == "pretrained_path")
             raise InputError(f"A recipe names no file, and {where} is {text!a:.80}{also}.")
-        if ".policy." in where and UNPINNED.fullmatch(text):
+        if _is_of_policy(where) and NAMED.fullmatch(text) and not COMMIT.fullmatch(text.partition("@")[2]):
             raise InputError(
                 f"A recipe names weights on the Hub by their commit, NAME@COMMIT: {where} is {text!a:.80}."
             )
@@ -93,12 +93,17 @@ def check_plain(values: Mapping[str, Any]) -> None:
 
 
 def starts_from(values: Mapping[str, Any]) -> str:
-    """The weights that the policy of a recipe starts from, NAME@COMMIT; empty where it starts from none."""
+    """The weights on the Hub that the policy of a recipe starts from, NAME@COMMIT; empty where there are none."""
     policies = [variant["policy"] for variant in values["variants"].values()]
     names = {
         f"{one['pretrained_path']}@{one['pretrained_revision']}" for one in policies if one.get("pretrained_path")
     }
+    names |= {text for where, text in _texts(values) if _is_of_policy(where) and NAMED.fullmatch(text)}
     return ", ".join(sorted(names))
+
+
+def _is_of_policy(where: str) -> bool:
+    return where.startswith("variants.") and ".policy." in where
 
 
 def _texts(value: Any, where: str = "") -> Iterator[tuple[str, str]]:

@@ -57,7 +57,11 @@ class TrainedAgain:
     @property
     def told(self) -> str:
         """It as sentences."""
-        origin = f" Training starts from {self.starts_from}, of which it tells nothing." if self.starts_from else ""
+        origin = (
+            f" Training starts from {self.starts_from}; training again does not check these weights."
+            if self.starts_from
+            else ""
+        )
         return self._compared + origin
 
     @property

@@ -174,11 +174,10 @@ def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:
     own = next((side for side in known if are_apart(side.starts_of_each)), None)
     if own is None:
         return None
-    draws = [{frozenset(starts) for starts in side.starts_of_each if starts} for side in known]
-    every = [*map(set, set.union(*draws))]
-    lacking = [len(every) - len(one) for one in draws]
-    failed = [side.starts_of_each.count(set()) for side in known]
-    if len(known) == 2 and are_apart(every) and all(a <= b for a, b in zip(lacking, failed, strict=True)):
+    lists = [{frozenset(starts) for starts in side.starts_of_each if starts} for side in known]
+    every = [*map(set, set.union(*lists))]
+    is_whole = [len(every) == len(own) + side.failed_draws for own, side in zip(lists, known, strict=True)]
+    if len(known) == 2 and are_apart(every) and all(is_whole):
         return every
     raise InputError(
         f"Each draw of '{own.name}' has starts of its own: it can be compared with a study's variant whose draws have "

@@ -90,6 +90,14 @@ class Side:
         return [set(placed or ()) for placed in self.seeds]
 
     @property
+    def failed_draws(self) -> int:
+        """How many draws, or seeds where each is one, failed whole."""
+        numbers = self.numbers or range(len(self.seeds))
+        of = self.draws.unit if self.draws else int
+        ran = {of(number) for number, placed in zip(numbers, self.seeds, strict=True) if placed}
+        return len({*map(of, numbers)} - ran)
+
+    @property
     def starts(self) -> set[int] | None:
         """Starts that all training seeds were evaluated from; None if every seed failed."""
         finished = [set(placed) for placed in self.seeds if placed is not None]

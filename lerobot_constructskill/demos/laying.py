@@ -12,8 +12,11 @@ from lerobot_constructskill.demos.state import PrivilegedState
 FULL_LEVER = 0.65
 """Distance in metres from the robot's base at which `ExpertConfig.compliance` was measured."""
 
-ROUND = 0.32
+ROUND = 0.40
 """Distance in metres at which the hand goes round the robot's base."""
+
+PASSING = 0.01
+"""Metres by which a way comes nearer to the robot's base than its ends are, if it passes it."""
 
 TOUCHING = 0.002
 """Height in metres over the floor from which down an element's lowest corner carries a part of its weight."""
@@ -28,11 +31,12 @@ class LayingExpert(PreciseExpert):
 
     def _way(self, error: np.ndarray, state: PrivilegedState) -> np.ndarray:
         """Round the robot's base where the straight way leads too near it, as to an element that waits beside it."""
-        here, ahead = (state.tcp - ROBOT_BASE)[:2], error[:2]
-        passed = float(np.clip(-(here @ ahead) / max(ahead @ ahead, 1e-9), 0, 1))
-        closest = here + passed * ahead
+        here, goal = (state.tcp - ROBOT_BASE)[:2], (state.tcp - ROBOT_BASE + error)[:2]
+        # Steps are limited along each axis, so a long way begins at 45 degrees.
+        corner = here + np.sign(error[:2]) * abs(error[:2]).min()
+        closest = min(_closest(here, corner), _closest(corner, goal), key=np.linalg.norm)
         distance = float(np.linalg.norm(closest))
-        if passed in (0.0, 1.0) or distance > NEAREST:
+        if distance > NEAREST or distance > min(np.linalg.norm(here), np.linalg.norm(goal)) - PASSING:
             return error
         outward = closest / distance if closest[0] > 0 else np.array([1.0, 0.0])  # never behind the robot
         return np.array([*(outward * ROUND - here), error[2]])
@@ -64,6 +68,12 @@ class LayingExpert(PreciseExpert):
 
     def _obstacle(self, state: PrivilegedState, grasp: np.ndarray) -> float:
         return _highest(state.obstacle, state)
+
+
+def _closest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The point of a way that is closest to the origin, (2,)."""
+    way = end - start
+    return start + float(np.clip(-(start @ way) / max(way @ way, 1e-9), 0, 1)) * way
 
 
 def _highest(height: float, state: PrivilegedState) -> float:

@@ -180,7 +180,7 @@ def frames_digest(config: GenerateConfig) -> str:
 def frame_facts(config: GenerateConfig) -> dict[str, Any]:
     """The encoder's options, the columns and the plans, on which a data set depends beside its settings."""
     columns = demonstration_features(config.rows[0], config.seen, config.state)
-    plans = {row.name: read_plan(row.plan).facts() for row in config.rows if row.plan is not None}
+    plans = {row.name: read_plan(row.plan).laid() for row in config.rows if row.plan is not None}
     if plans:
         plans = {"plans": plans} if len(config.rows) > 1 else {"plan": plans[config.rows[0].name]}
     return {"encoder": VIDEOS[config.video].encoder, "columns": digest(columns)} | plans

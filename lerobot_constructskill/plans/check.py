@@ -5,7 +5,7 @@ from math import hypot
 
 from lerobot_constructskill.contract import ROBOT_BASE, highest_tcp
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.plans.plan import Element, Kind, Plan, Position, supplies
+from lerobot_constructskill.plans.plan import KINDS, Kind, Plan, Position, supplies
 
 NEAREST, FARTHEST = 0.30, 0.76
 """Horizontal distances in metres from the robot's base between which the hand lays with its fingers down."""
@@ -59,7 +59,8 @@ def complaints(plan: Plan) -> Iterator[str]:
         yield from _of_reach(*box, laid, plan)
         yield from _of_support(*box, [other for other in laid if other[0] in plan.elements[box[0]].on])
         for other in laid:
-            yield from _of_earlier(*box, *other, plan.elements[box[0]])
+            yield from _of_earlier(*box, *other)
+            yield from _of_lengths(plan, box, other)
         laid.append(box)
 
 
@@ -70,6 +71,9 @@ def _of_reach(name: str, place: Position, kind: Kind, laid: list[Box], plan: Pla
             f"The element '{name}' lies {away:.2f} m from the robot's base at x = {ROBOT_BASE[0]}, y = "
             f"{ROBOT_BASE[1]:g}; the hand lays between {NEAREST} and {FARTHEST} m."
         )
+        return
+    if place[0] < ROBOT_BASE[0]:
+        yield f"The element '{name}' lies behind the robot, whose base stands at x = {ROBOT_BASE[0]}."
         return
     stands = [*(one.size[2] for one in plan.kinds), *(middle[2] + one.size[2] / 2 for _, middle, one in laid)]
     carried = max(stands) + CARRIED_OVER + kind.size[2] - HELD_BELOW
@@ -113,8 +117,8 @@ def _of_waiting(plan: Plan) -> Iterator[str]:
             ]
             if max(gaps) < 2 * WAITS_WITHIN:
                 yield (
-                    f"The elements '{other}' and '{name}' would wait in each other: their places in the order of "
-                    "laying are next to each other, and both are too long."
+                    f"The elements '{other}' and '{name}' would overlap where they wait: their places in the order "
+                    "of laying are next to each other, and both are too long."
                 )
 
 
@@ -141,6 +145,32 @@ def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterat
             return
 
 
+def _of_lengths(plan: Plan, box: Box, earlier: Box) -> Iterator[str]:
+    """Whether there is room for what the lengths of elements vary by between one that lies still and another."""
+    (name, place, kind), (other, its_place, its_kind) = box, earlier
+    gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
+    is_fixed = plan.elements[name].at is not None or plan.elements[other].at is not None
+    if not is_fixed or plan.elements[name].beside == other or max(gaps[1:]) > -CLOSE or gaps[0] < -CLOSE:
+        return
+    varies = sum(_strays(plan, one) + of.deviations[0] / 2 for one, of in ((name, kind), (other, its_kind)))
+    if gaps[0] < varies:
+        yield (
+            f"The elements '{other}' and '{name}' are {1000 * max(gaps[0], 0):.1f} mm apart, and what elements differ "
+            f"in length adds up to {1000 * varies:.1f} mm there: lay '{name}' beside '{other}', or farther away."
+        )
+
+
+def _strays(plan: Plan, name: str) -> float:
+    """How far in x an element's middle may be off its drawn place, because lengths vary, in metres."""
+    element = plan.elements[name]
+    if element.at is not None:
+        return 0.0
+    if element.beside is None:
+        return max(_strays(plan, other) for other in element.on)
+    ends = [KINDS[plan.elements[one].kind].deviations[0] / 2 for one in (name, element.beside)]
+    return _strays(plan, element.beside) + sum(ends)
+
+
 def _of_earlier(
     name: str,
     place: Position,
@@ -148,20 +178,12 @@ def _of_earlier(
     other: str,
     its_place: Position,
     its_kind: Kind,
-    element: Element,
 ) -> Iterator[str]:
     """What stands between an element and one that is laid before it."""
     gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
     if max(gaps) < -CLOSE:
         yield f"The elements '{other}' and '{name}' are in one place."
         return
-    if max(gaps) > -CLOSE and gaps[2] < -CLOSE and gaps[1] < -CLOSE and not element.beside:
-        varies = (kind.deviations[0] + its_kind.deviations[0]) / 2
-        if gaps[0] < varies:
-            yield (
-                f"The elements '{other}' and '{name}' are {1000 * max(gaps[0], 0):.1f} mm apart, and their lengths "
-                f"vary by {1000 * varies:.1f} mm together: lay '{name}' beside '{other}', or farther away."
-            )
     if max(gaps[:2]) < -CLOSE and its_place[2] > place[2]:
         yield f"The element '{name}' lies below '{other}', which is laid before it."
         return

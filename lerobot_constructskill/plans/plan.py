@@ -166,6 +166,10 @@ class Plan:
         """The plan as plain values."""
         return asdict(self)
 
+    def laid(self) -> dict[str, Any]:
+        """What of it decides how it is laid and what counts as placed: all but its words."""
+        return {name: value for name, value in self.facts().items() if name not in ("instruction", "standard")}
+
 
 def _floor(length: Any, supports: Sequence[tuple[Position, Position]]) -> Any:
     """Height in metres on which the middle of an element of this length comes to rest.

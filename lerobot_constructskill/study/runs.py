@@ -91,7 +91,7 @@ class Arm:
     def place(self) -> dict[str, Any]:
         """Where its episodes take place: the environment, and what stands in the plan that it names."""
         plan = get_task(self.env["task"]).plan
-        return self.env | ({"plan": read_plan(plan).facts()} if plan else {})
+        return self.env | ({"plan": read_plan(plan).laid()} if plan else {})
 
 
 @dataclass(frozen=True, eq=False)

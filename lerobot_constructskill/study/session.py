@@ -24,7 +24,6 @@ from lerobot_constructskill.study.rows import KNOWN, PROVENANCE, STUDY, WALL_TIM
 from lerobot_constructskill.study.runs import Job, Run, make_runs
 from lerobot_constructskill.study.spec import Options, Study
 from lerobot_constructskill.study.table import Table
-from lerobot_constructskill.study.timing import forget_times
 from lerobot_constructskill.study.validate import validate
 from lerobot_constructskill.training.trainers import flush_denormals
 
@@ -59,8 +58,6 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
                 with store.claim([run]):  # one by one: each holds a file open
                     pass  # which tidies up after a process that was killed when it was whole
         missing = [run for run in chosen if table.made(run) is None]
-        begun = {run.arm.id for run in runs if table.made(run)}
-        forget_times(root, {run.arm.id for run in missing if table.outdated(run)} - begun)
         table.write()
         with Progress(total=len(chosen), initial=len(chosen) - len(missing), desc=study.name, unit="run") as progress:
             for run in _execute(_jobs(missing, root, store, options), options):

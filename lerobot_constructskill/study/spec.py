@@ -145,6 +145,8 @@ class Study:
                 )
         if self.demonstrations == SHARED and (self.starts, self.seeds_a_draw) != (SHARED, 1):
             raise InputError("starts and seeds_a_draw are of draws: they need `demonstrations: own`.")
+        if odd := next((name for name, one in self.variants.items() if one.seeds % self.seeds_a_draw), None):
+            raise InputError(f"variants.{odd}.seeds must be a multiple of seeds_a_draw, {self.seeds_a_draw}.")
         if bare := [name for name in self.settings if not self.variants_in(name)]:
             raise InputError(f"No variant runs in the setting '{bare[0]}', so there would be nothing to report.")
 

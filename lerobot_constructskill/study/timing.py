@@ -3,7 +3,7 @@
 import json
 import time
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Annotated, NotRequired, TypedDict
 
 from annotated_types import Ge, Lt
 
-from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.files import Json, read_bytes
 
 TIMINGS = "timings.jsonl"
@@ -64,13 +63,6 @@ def timed(root: Path, arm: str, stage: str, runs: int, nodes: int = 1) -> Iterat
     entry |= {"nodes": nodes} if nodes > 1 else {}
     with (root / TIMINGS).open("a", encoding="utf-8") as file:  # a short write, which others do not tear
         file.write(json.dumps(entry) + "\n")
-
-
-def forget_times(root: Path, arms: Collection[str]) -> None:
-    """Drop the times of arms whose rows are of other code and about to be replaced."""
-    file = root / TIMINGS
-    if arms and file.exists():
-        write_text(file, "".join(f"{json.dumps(entry)}\n" for entry in entries(root) if entry["arm"] not in arms))
 
 
 def time_by_stage(root: Path) -> list[Took]:

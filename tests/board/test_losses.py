@@ -100,8 +100,11 @@ def test_what_depends_on_the_seed():
     assert association([0, 0], ["a", "b"], [0, 0]) == association([0, 1], ["a", "a"], [0, 0]) == 1.0
     # One seed failed from the first start alone and the other from the second: the start may be the reason.
     assert association([0] * 8 + [1] * 8, ["a"] * 8 + ["b"] * 8, [0] * 8 + [1] * 8) == 1.0
-    assert depends_on_seed(Losses([row(20)] * 9)) == "too few failures to tell"
-    assert depends_on_seed(Losses([row(20, seed=seed % 2) for seed in range(10)])) == "p = 1.00"
+    untold = "cannot be told from these failures"
+    several = [row(20, seed=seed % 2, lost=(Lost.DROPPED, Lost.TIPPED)[seed // 2 % 2]) for seed in range(12)]
+    assert depends_on_seed(Losses(several[:8])) == depends_on_seed(Losses([row(20)] * 12)) == untold
+    assert depends_on_seed(Losses([row(20, seed=seed % 2) for seed in range(12)])) == untold, "one kind of loss"
+    assert depends_on_seed(Losses(several)) == "p = 1.00"
 
 
 def test_a_board_shows_what_is_known_of_this_submission_alone(valid, tmp_path, monkeypatch):

@@ -43,6 +43,7 @@ RECIPE = {
             "hf/ada/encoder",
             "by their commit, NAME@COMMIT: variants.ours.policy.backbone is 'hf/ada/encoder'",
         ),
+        ("backbone", "hf/ada/encoder@main", "by their commit"),
         ("vlm_model_name", "ada/vlm", "by their commit"),
     ],
 )
@@ -62,7 +63,9 @@ def test_weights_of_one_commit_on_the_hub_are_plain_data():
     policy |= {"pretrained_path": "lerobot/smolvla_base", "pretrained_revision": "0a" * 20}
     check_plain(recipe)
     assert starts_from(recipe) == f"lerobot/smolvla_base@{'0a' * 20}" and not starts_from(RECIPE)
-    check_plain(json.loads(json.dumps(RECIPE).replace("efficientnet_lite0", "hf/ada/encoder@0a0a0a")))
+    encoder = f"hf/ada/encoder@{'0a' * 20}"
+    check_plain(named := json.loads(json.dumps(RECIPE).replace("efficientnet_lite0", encoder)))
+    assert starts_from(named) == encoder
     for changed in (
         {"pretrained_path": "../smolvla_base"},
         {"pretrained_path": "a/b/c"},

@@ -121,8 +121,11 @@ def test_draws_with_starts_of_their_own_may_have_different_numbers_of_seeds(stud
     comparison = compared(one, two)
     assert comparison.judgement.counts_a.seeds == comparison.judgement.counts_b.seeds == 3
     assert comparison.rates_b == [0.9, 0.7, 0.2, 0.2, 0.5, 0.5] and len(comparison.starts) == 30
-    with pytest.raises(InputError, match="has starts of its own: .* and as many draws"):
-        compared(one, study([9, 7, 2, 2], "fewer", draws=own | {"seeds_a_draw": 2}))
+    for name, placed in (("fewer", [9, 7, 2, 2]), ("failed", [9, None, 2, 2])):
+        with pytest.raises(InputError, match="has starts of its own: .* and as many draws"):
+            compared(one, study(placed, name, draws=own | {"seeds_a_draw": 2}))
+    lost = compared(one, study([9, 7, None, None, 5, 5], "lost", draws=own | {"seeds_a_draw": 2}))
+    assert lost.rates_b == [0.9, 0.7, 0.0, 0.0, 0.5, 0.5] and len(lost.starts) == 30
 
 
 def test_a_failed_seed_whose_draw_has_starts_of_its_own_placed_nothing(study):

@@ -9,8 +9,9 @@ import pytest
 from commands import call
 
 from lerobot_constructskill.contract import MAX_PLACEMENTS, SHIPPED, SIM_STATE, get_task
-from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.demos.settings import GenerateConfig, frames_digest
+from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
+from lerobot_constructskill.errors import FieldError, InputError, MissingError
 from lerobot_constructskill.plans.check import check_plan, complaints
 from lerobot_constructskill.plans.ifc import plan_of
 from lerobot_constructskill.plans.measure import measure
@@ -115,12 +116,20 @@ def test_what_the_arm_or_the_sizes_leave_no_room_for_is_refused():
     ]
     assert not [*complaints(plan(low=behind.pop("low"), **behind))]
     touching = plan(a=FLAT["a"], b=brick | {"at": [FLAT["a"]["at"][0] + BRICK[0], FLAT["a"]["at"][1]]})
-    assert "'a' and 'b' are 0.0 mm apart, and their lengths vary by 3.6 mm together" in "".join(complaints(touching))
+    assert "'a' and 'b' are 0.0 mm apart, and what elements differ in length adds up to 3.6 mm" in "".join(
+        complaints(touching)
+    )
+    x, y = FLAT["a"]["at"]
+    between = {"a": FLAT["a"], "c": brick | {"at": [x + 2 * BRICK[0] + 0.0105, y]}, "b": brick | {"beside": "a"}}
+    assert "'c' and 'b' are 0.5 mm apart, and what elements differ in length adds up to 7.2 mm" in "".join(
+        complaints(plan(**between))
+    )
+    assert "'a' lies behind the robot" in "".join(complaints(plan(a=brick | {"at": [-0.85, -0.25]})))
     assert not [*complaints(plan(a=FLAT["a"], b=brick | {"beside": "a", "joint": 0.0}))], "it is laid where 'a' ends"
     beams = plan(
         **{name: {"kind": "beam", "at": [-0.25, y]} for name, y in {"a": -0.2, "b": -0.35, "c": -0.5}.items()}
     )
-    assert "'b' and 'c' would wait in each other" in "".join(complaints(beams))
+    assert "'b' and 'c' would overlap where they wait" in "".join(complaints(beams))
 
 
 def test_elements_that_wait_leave_the_fingers_room():
@@ -167,6 +176,17 @@ def test_a_set_of_plans_has_the_steps_and_the_sentences_that_it_needs():
     with pytest.raises(InputError, match="asked for by one sentence, 'Build the wall after its plan.'"):
         GenerateConfig("local/x", task="plan:course_of_three,plan:lintel_on_posts")
     GenerateConfig("local/x", task="wall", max_steps=2000)
+    assert ConstructSkillEnvConfig(plan="bond_of_five").task == "plan:bond_of_five"
+    with pytest.raises(FieldError, match="bond_of_five is a task of its own: leave out --env.task=orders"):
+        ConstructSkillEnvConfig(task="orders", plan="bond_of_five")
+
+
+def test_the_words_of_a_plan_decide_nothing(tmp_path):
+    digests = set()
+    for words in ({}, {"instruction": "Build it.", "standard": "none"}, {"tolerance": 0.004}):
+        (tmp_path / "p.yaml").write_text(written({"elements": FLAT} | words))
+        digests.add(frames_digest(GenerateConfig("local/x", task=f"plan:{tmp_path / 'p.yaml'}")))
+    assert len(digests) == 2
 
 
 def test_any_plan_is_a_task_of_every_command():

@@ -220,6 +220,8 @@ def test_seeds_of_a_draw_share_its_demonstrations_and_starts_and_no_other_draw_h
     for fields in ({"starts": "own"}, {"seeds_a_draw": 2}):
         with pytest.raises(InputError, match="they need `demonstrations: own`"):
             study(**fields)
+    with pytest.raises(InputError, match=r"variants\.a\.seeds must be a multiple of seeds_a_draw, 2"):
+        replace(drawn, variants={"a": Variant(ACT, seeds=5)})
 
 
 def test_a_run_depends_on_what_stands_in_its_plan_and_its_row_says_what_was_asked(tmp_path):
@@ -562,26 +564,6 @@ def test_rows_of_other_code_are_replaced_an_arm_at_a_time(tmp_path):
     assert Table(tmp_path / "x", list_runs(fewer), mine, replaces=True).lost() == ["fixed/b/seed_0", "fixed/b/seed_1"]
     with pytest.raises(InputError, match="would be lost. Give another --root, or move the folder away"):
         run_study(fewer, "", tmp_path / "x", mine, Options(replace=True))
-
-
-def test_the_times_of_rows_that_are_replaced_go_with_them(tmp_path, monkeypatch):
-    table = make_all(study(), tmp_path)
-    folder, mine = tmp_path / "x", Store(tmp_path / "mine")
-    write_rows([replace(row, run=None) for row in load_rows(folder / ROWS)], folder / ROWS)
-    monkeypatch.setattr(session, "make_runs", lambda job: iter(()))
-    monkeypatch.setattr(session, "validate", lambda *_: None)
-
-    def times_after(only: str) -> list[str]:
-        for arm in ("fixed/a", "fixed/b"):
-            with timed(folder, arm, "training", 1):
-                pass
-        run_study(study(), "", folder, mine, Options(only=only, replace=True))
-        return [entry["arm"] for entry in entries(folder)]
-
-    assert times_after("fixed/a") == ["fixed/b"]
-    run = next(run for run in table.runs if run.id == "fixed/a/seed_1")
-    shutil.copytree(table.store.folder(run), mine.folder(run))
-    assert times_after("fixed/a") == ["fixed/b", "fixed/a", "fixed/b"], "some of its rows are of today's code"
 
 
 def test_a_failure_of_ours_takes_no_finished_row_out_of_a_published_table(tmp_path):
