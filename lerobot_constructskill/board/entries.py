@@ -13,7 +13,7 @@ from lerobot_constructskill.analysis.stats.walls import over_seeds
 from lerobot_constructskill.board.copies import near_copy
 from lerobot_constructskill.board.declaration import NAME, Declaration
 from lerobot_constructskill.board.protocol import CLAIMED, RANKED_FROM, TRAINING_SEEDS, PublicValue
-from lerobot_constructskill.board.recovered import Recovery, is_current, path_of, read_recovered
+from lerobot_constructskill.board.recovered import Recovery, path_of, read_recovered
 from lerobot_constructskill.board.rerun import check_later
 from lerobot_constructskill.board.submission import SCORES, Claim, Submission, read_submission
 from lerobot_constructskill.board.verification import different, read_verification
@@ -72,7 +72,7 @@ class Entry:
         level: one of `protocol.LEVELS`.
         verdict: result of its verification; empty if it was not verified.
         recoveries: where its failed episodes were lost, by setting, training seed and start; empty if unknown.
-        recoveries_are_older: whether they were found by code that is no longer this one.
+        recoveries_are_current: whether this code would find the same.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Entry:
     level: str
     verdict: dict[str, Any]
     recoveries: dict[tuple[str, int, int], Recovery]
-    recoveries_are_older: bool = False
+    recoveries_are_current: bool
 
     @property
     def declaration(self) -> Declaration:
@@ -230,10 +230,8 @@ def _entry(root: Path, path: Path) -> Entry:
     verdict = read_verification(root / VERIFIED / f"{path.name}.json", submission.sha256)
     if "rerun" in verdict:
         check_later(PublicValue.of(verdict["rerun"]["value"]), str(verdict["date"]))
-    table = path_of(root, path.name)
-    recoveries = read_recovered(table, submission.sha256)
-    is_older = bool(recoveries) and not is_current(table, submission.sha256)
-    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, recoveries, is_older)
+    recovered = read_recovered(path_of(root, path.name), submission.sha256)
+    return Entry(path.name, submission, verdict.get("level", CLAIMED), verdict, *recovered)
 
 
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:

@@ -29,6 +29,9 @@ A_PATH = re.compile(r"[/~.\\]|.*(\.\.|\\)|.*\.(ya?ml|json|safetensors|ckpt|bin|p
 
 ON_THE_HUB, COMMIT = re.compile(r"[\w-][\w.-]*/[\w-][\w.-]*"), re.compile("[0-9a-f]{40}")
 
+OF_POLICY = re.compile(r"variants\.[^.]+\.policy\..*")
+"""Where a field of a policy stands."""
+
 NAMED = re.compile(rf"(hf/)?{ON_THE_HUB.pattern}(@.*)?")
 """Weights on the Hub, as a field of a policy names them; without a commit they may be others tomorrow."""
 
@@ -81,7 +84,7 @@ def check_plain(values: Mapping[str, Any]) -> None:
         if field.endswith("path"):
             also = " without pretrained_revision, a commit on the Hub" * (field == "pretrained_path")
             raise InputError(f"A recipe names no file, and {where} is {text!a:.80}{also}.")
-        if _is_of_policy(where) and NAMED.fullmatch(text) and not COMMIT.fullmatch(text.partition("@")[2]):
+        if OF_POLICY.fullmatch(where) and NAMED.fullmatch(text) and not COMMIT.fullmatch(text.partition("@")[2]):
             raise InputError(
                 f"A recipe names weights on the Hub by their commit, NAME@COMMIT: {where} is {text!a:.80}."
             )
@@ -92,18 +95,12 @@ def check_plain(values: Mapping[str, Any]) -> None:
             raise InputError(f"A recipe names shipped plans, and {where} is {text!a:.80}.")
 
 
-def starts_from(values: Mapping[str, Any]) -> str:
+def starts_from(policy: Mapping[str, Any]) -> str:
     """The weights on the Hub that the policy of a recipe starts from, NAME@COMMIT; empty where there are none."""
-    policies = [variant["policy"] for variant in values["variants"].values()]
-    names = {
-        f"{one['pretrained_path']}@{one['pretrained_revision']}" for one in policies if one.get("pretrained_path")
-    }
-    names |= {text for where, text in _texts(values) if _is_of_policy(where) and NAMED.fullmatch(text)}
+    names = {text for _, text in _texts(policy) if NAMED.fullmatch(text)}
+    if policy.get("pretrained_path"):
+        names.add(f"{policy['pretrained_path']}@{policy['pretrained_revision']}")
     return ", ".join(sorted(names))
-
-
-def _is_of_policy(where: str) -> bool:
-    return where.startswith("variants.") and ".policy." in where
 
 
 def _texts(value: Any, where: str = "") -> Iterator[tuple[str, str]]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lerobot_constructskill.board.causes import cause
 from lerobot_constructskill.board.entries import Entry
-from lerobot_constructskill.board.recovered import FAILED, Lost, Recovery, is_current, path_of, write_recovered
+from lerobot_constructskill.board.recovered import FAILED, Lost, Recovery, path_of, write_recovered
 from lerobot_constructskill.board.replay import jobs_of, open_simulator, open_workers
 from lerobot_constructskill.board.submission import Claim
 from lerobot_constructskill.board.takeover import (
@@ -51,7 +51,7 @@ def write_missing(root: Path, entries: Sequence[Entry], workers: int | None = No
     Raises:
         OSError: a worker died.
     """
-    due = [one for one in entries if not is_current(path_of(root, one.name), one.submission.sha256)]
+    due = [one for one in entries if not one.recoveries_are_current]
     failed = {one.name: own for one in due if (own := one.failures)}
     order = sorted((one for one in due if one.name in failed), key=lambda one: len(failed[one.name]))
     total = sum(map(len, failed.values()))

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -124,32 +125,30 @@ def write_recovered(path: Path, submission: str, rows: Iterable[Recovery]) -> No
         pq.write_table(table, partial, compression="zstd")
 
 
-def read_recovered(path: Path, submission: str) -> dict[tuple[str, int, int], Recovery]:
-    """The rows of the submission with this hash by their keys; empty without a file, or where it is of another one.
+class Recovered(NamedTuple):
+    """The table of a submission.
+
+    Args:
+        rows: by their keys; empty without a file, or where it is of another submission.
+        is_current: whether this code would make them again, on whatever make of processor.
+    """
+
+    rows: dict[tuple[str, int, int], Recovery]
+    is_current: bool
+
+
+def read_recovered(path: Path, submission: str) -> Recovered:
+    """The table of the submission with this hash.
 
     Raises:
         InputError: the file is no such table.
     """
     if not path.exists():
-        return {}
+        return Recovered({}, False)
     table = TABLE.read(path)
-    if (table.schema.metadata or {}).get(b"submission") != submission.encode():
-        return {}
-    rows = [Recovery(**row) for row in table.to_pylist()]
-    return {row.key: row for row in rows}
-
-
-def is_current(path: Path, submission: str) -> bool:
-    """Whether a table is there that this code would make again of this submission, on whatever make of processor.
-
-    Raises:
-        InputError: the file is no such table.
-    """
-    if not path.exists():
-        return False
-    said = TABLE.read(path).schema.metadata or {}
+    said = table.schema.metadata or {}
+    if said.get(b"submission") != submission.encode():
+        return Recovered({}, False)
     there = VERSIONS.parse(said.get(b"made_with", b"{}").decode(), f"made_with in '{path}'")
-    here = made_with()
-    return said.get(b"submission") == submission.encode() and all(
-        there.get(name) == version for name, version in here.items() if name != "processor"
-    )
+    is_current = all(there.get(name) == own for name, own in made_with().items() if name != "processor")
+    return Recovered({row.key: row for row in (Recovery(**row) for row in table.to_pylist())}, is_current)

@@ -110,7 +110,8 @@ def retrain(submission: Submission, study: Study, root: Path, options: Options) 
         raise InputError(NO_RECIPE)
     store, text = Store((root / "store").absolute()), submission.recipe or ""
     table = run_study(study, text, root.absolute() / submission.sha256[:16], store, options)
-    return _compare(submission, trained, table)
+    (variant,) = study.variants.values()
+    return _compare(submission, trained, table, starts_from(variant.policy))
 
 
 def _check_code(runs: Sequence[Run], allowed: Sequence[str]) -> None:
@@ -145,11 +146,11 @@ def _check_runs(submission: Submission, study: Study, runs: Sequence[Run]) -> No
             raise InputError(f"The recipe shows its policies {shown}; the submission says {said}.")
 
 
-def _compare(submission: Submission, trained: Trained, table: Table) -> TrainedAgain:
+def _compare(submission: Submission, trained: Trained, table: Table, origin: str) -> TrainedAgain:
     rows = {(run.arm.setting, run.seed): table.made(run) or [] for run in table.runs}
     rates = _rates(submission, rows)
     versions = [one.versions for own in rows.values() for one in own if one.versions]
-    here, origin = merged(map(json.loads, versions)), starts_from(read_recipe(submission.recipe or ""))
+    here = merged(map(json.loads, versions))
     if others := different(trained.made_with, here):
         return TrainedAgain(confirm(rates, "training seeds", AGAIN), others, origin)
     if unlike := next(_unlike(submission, trained, table), None):

@@ -92,10 +92,7 @@ class Side:
     @property
     def failed_draws(self) -> int:
         """How many draws, or seeds where each is one, failed whole."""
-        numbers = self.numbers or range(len(self.seeds))
-        of = self.draws.unit if self.draws else int
-        ran = {of(number) for number, placed in zip(numbers, self.seeds, strict=True) if placed}
-        return len({*map(of, numbers)} - ran)
+        return int((self.units([bool(placed) for placed in self.seeds]) == 0).sum())
 
     @property
     def starts(self) -> set[int] | None:

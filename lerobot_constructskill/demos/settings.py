@@ -94,15 +94,16 @@ class GenerateConfig:
 
     def __post_init__(self):
         check(self)
-        self._check_plans(list_tasks(self.task, self.action))
+        self._check_plans()
         if self.cameras is not None and not (self.cameras and {*self.cameras} <= {*OBS_TYPES[self.obs_type]}):
             raise InputError(
                 f"cameras must be some of {', '.join(OBS_TYPES[self.obs_type])}, which {self.obs_type} has, not "
                 f"{', '.join(self.cameras) or 'none'}."
             )
 
-    def _check_plans(self, rows: list[Task]) -> None:
-        """Refuse plans that take longer than an attempt, and two that one sentence asks for."""
+    def _check_plans(self) -> None:
+        """Refuse a task that there is not, plans that take longer than an attempt, and two of one sentence."""
+        rows = self.rows
         for row in rows:
             elements = len(read_plan(row.plan).elements) if row.plan else 0
             if self.max_steps < elements * STEPS_AN_ELEMENT:

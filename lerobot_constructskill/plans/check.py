@@ -1,11 +1,11 @@
 """Whether a plan can be built by this robot: reach, room for the fingers, support, and the order of laying."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import hypot
 
 from lerobot_constructskill.contract import ROBOT_BASE, highest_tcp
 from lerobot_constructskill.errors import InputError
-from lerobot_constructskill.plans.plan import KINDS, Kind, Plan, Position, supplies
+from lerobot_constructskill.plans.plan import KINDS, WAITS_WITHIN, Kind, Plan, Position, supplies
 
 NEAREST, FARTHEST = 0.30, 0.76
 """Horizontal distances in metres from the robot's base between which the hand lays with its fingers down."""
@@ -27,9 +27,6 @@ CLOSE = 0.0005
 
 LEANING = 0.006
 """Largest planned difference in metres between the heights of what carries one element."""
-
-WAITS_WITHIN = 0.03
-"""Metres in x and in y by which an element may wait off its place (`sim.tasks.wall`)."""
 
 APART = 0.12
 """Distance in metres across the wall that an element keeps from those that wait."""
@@ -89,9 +86,7 @@ def _of_reach(name: str, place: Position, kind: Kind, laid: list[Box], plan: Pla
         if middle[2] + one.size[2] / 2 > top - HELD_BELOW + WRIST_ABOVE and _is_under_wrist(place, middle, one):
             yield f"There is no room for the arm at '{name}' behind '{other}', which is higher: lay '{name}' first."
     for start, one in zip(supplies(plan), plan.kinds, strict=True):
-        beside = abs(place[1] - start[1]) - (kind.size[1] + one.size[1]) / 2
-        along = abs(place[0] - start[0]) - (kind.size[0] + one.size[0]) / 2
-        if max(beside, along) < APART:
+        if max(_gaps(place, kind, start, one)) < APART:
             yield f"The element '{name}' lies where elements wait, on the side of the robot where y is above 0."
             return
 
@@ -100,11 +95,19 @@ def _is_under_wrist(place: Position, middle: Position, kind: Kind) -> bool:
     """Whether an element lies between where the hand is and the robot, so near that the wrist would be in it."""
     toward = [ROBOT_BASE[axis] - place[axis] for axis in (0, 1)]
     away = hypot(*toward)
-    for step in range(5):
-        point = [place[axis] + toward[axis] / away * WRIST_LENGTH * step / 4 for axis in (0, 1)]
-        if all(abs(point[axis] - middle[axis]) < (kind.size[axis] + WRIST_WIDTH) / 2 for axis in (0, 1)):
-            return True
-    return False
+    points = ([place[axis] + toward[axis] / away * WRIST_LENGTH * step / 4 for axis in (0, 1)] for step in range(5))
+    return any(
+        all(abs(point[axis] - middle[axis]) < (kind.size[axis] + WRIST_WIDTH) / 2 for axis in (0, 1))
+        for point in points
+    )
+
+
+def _gaps(place: Sequence[float], kind: Kind, other: Sequence[float], its_kind: Kind) -> list[float]:
+    """Distances in metres between two elements along each axis of their places, below 0 where they overlap."""
+    return [
+        abs(a - b) - (size + its_size) / 2
+        for a, b, size, its_size in zip(place, other, kind.size, its_kind.size, strict=False)
+    ]
 
 
 def _of_waiting(plan: Plan) -> Iterator[str]:
@@ -112,10 +115,7 @@ def _of_waiting(plan: Plan) -> Iterator[str]:
     waiting = list(zip(plan.elements, supplies(plan), plan.kinds, strict=True))
     for number, (name, place, kind) in enumerate(waiting):
         for other, its_place, its_kind in waiting[:number]:
-            gaps = [
-                abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in (0, 1)
-            ]
-            if max(gaps) < 2 * WAITS_WITHIN:
+            if max(_gaps(place, kind, its_place, its_kind)) < 2 * WAITS_WITHIN:
                 yield (
                     f"The elements '{other}' and '{name}' would overlap where they wait: their places in the order "
                     "of laying are next to each other, and both are too long."
@@ -126,7 +126,7 @@ def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterat
     if not on:
         return
     for other, middle, one in on:
-        if any(abs(place[axis] - middle[axis]) >= (kind.size[axis] + one.size[axis]) / 2 for axis in (0, 1)):
+        if max(_gaps(place[:2], kind, middle, one)) >= 0:
             yield f"The element '{name}' does not reach '{other}', which is to carry it: it would hang in the air."
             return
     tops = [middle[2] + one.size[2] / 2 for _, middle, one in on]
@@ -148,7 +148,7 @@ def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterat
 def _of_lengths(plan: Plan, box: Box, earlier: Box) -> Iterator[str]:
     """Whether there is room for what the lengths of elements vary by between one that lies still and another."""
     (name, place, kind), (other, its_place, its_kind) = box, earlier
-    gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
+    gaps = _gaps(place, kind, its_place, its_kind)
     is_fixed = plan.elements[name].at is not None or plan.elements[other].at is not None
     if not is_fixed or plan.elements[name].beside == other or max(gaps[1:]) > -CLOSE or gaps[0] < -CLOSE:
         return
@@ -180,7 +180,7 @@ def _of_earlier(
     its_kind: Kind,
 ) -> Iterator[str]:
     """What stands between an element and one that is laid before it."""
-    gaps = [abs(place[axis] - its_place[axis]) - (kind.size[axis] + its_kind.size[axis]) / 2 for axis in range(3)]
+    gaps = _gaps(place, kind, its_place, its_kind)
     if max(gaps) < -CLOSE:
         yield f"The elements '{other}' and '{name}' are in one place."
         return

@@ -224,6 +224,9 @@ SUPPLIES = (
 )
 """x and y in metres of the places where elements wait, on the other side of the robot than walls."""
 
+WAITS_WITHIN = 0.03
+"""Metres in x and in y by which an element may wait off its place."""
+
 
 def written(plan: Mapping[str, Any]) -> str:
     """A plan's facts as the YAML that `read_plan` reads."""

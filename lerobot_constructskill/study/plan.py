@@ -13,13 +13,13 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig, check_apart
-from lerobot_constructskill.envs.gym_env import perturbed_task, resolve_rendering
+from lerobot_constructskill.envs.gym_env import resolve_rendering
 from lerobot_constructskill.errors import InputError, UserError
 from lerobot_constructskill.parsing import decode, parse_named
 from lerobot_constructskill.policy_types import decode_policy
 from lerobot_constructskill.rollout.references import REFERENCES, Reference
 from lerobot_constructskill.study.rows import OWN, REFERENCE, SHARED, SIGHTLESS, VARIANT
-from lerobot_constructskill.study.runs import Arm, NamedSet, Run
+from lerobot_constructskill.study.runs import Arm, NamedSet, Run, told_in
 from lerobot_constructskill.study.spec import Study, Variant
 from lerobot_constructskill.training.checkpoints import check_inputs
 from lerobot_constructskill.training.recipe import Training
@@ -146,8 +146,7 @@ def _check_told(learner: Learner, data: NamedSet, common: Mapping[str, Any]) -> 
         return
     env, tasks, levels = common["env"], data.node.config.rows, 1 if language == "number" else None
     known = {word for task in tasks for word in (task.instruction, *chain(*task.rewordings[:levels]))}
-    task, perturbation = perturbed_task(env["task"], env["perturb"], env["perturb_seed"])
-    if (asked := perturbation.told(task).instruction) not in known:
+    if (asked := told_in(env)) not in known:
         raise InputError(
             f"In settings.{common['setting']} it is told '{asked}', which it cannot learn from '{data.name}': train "
             "on the task that is asked so, or evaluate another."

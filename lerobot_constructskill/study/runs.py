@@ -24,6 +24,7 @@ from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, write_recordings
+from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.plans.plan import read_plan
 from lerobot_constructskill.rollout.agents import Agent, PolicyAgent, caught
 from lerobot_constructskill.rollout.lockstep import FirstEpisode, Rollout, roll_out
@@ -87,11 +88,16 @@ class Arm:
     def id(self) -> str:
         return f"{self.setting}/{self.name}"
 
-    @property
+    @cached_property
     def place(self) -> dict[str, Any]:
         """Where its episodes take place: the environment, and what stands in the plan that it names."""
         plan = get_task(self.env["task"]).plan
         return self.env | ({"plan": read_plan(plan).laid()} if plan else {})
+
+
+def told_in(env: Mapping[str, Any]) -> str:
+    """The sentence that a policy is told in an environment, given as an arm has it."""
+    return Perturbation(env["perturb"], env["perturb_seed"]).told(get_task(env["task"])).instruction
 
 
 @dataclass(frozen=True, eq=False)

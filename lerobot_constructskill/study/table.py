@@ -14,10 +14,9 @@ from typing import Any
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.artifacts.store import Store
-from lerobot_constructskill.envs.gym_env import perturbed_task
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, EpisodeRow, Row, load_rows, write_rows
-from lerobot_constructskill.study.runs import EPISODES, FILMED_SEED, VIDEO, Run
+from lerobot_constructskill.study.runs import EPISODES, FILMED_SEED, VIDEO, Run, told_in
 from lerobot_constructskill.study.spec import video_path
 from lerobot_constructskill.study.validate import heldout
 from lerobot_constructskill.training.heldout import known_error
@@ -171,13 +170,12 @@ def _keys(run: Run) -> list[tuple[str, str, str]]:
 
 def _names(run: Run) -> dict[str, Any]:
     arm = run.arm
-    task, perturbation = perturbed_task(arm.env["task"], arm.env["perturb"], arm.env["perturb_seed"])
     return {
         "setting": arm.setting,
         "variant": arm.name,
         "role": arm.role,
         "episodes": len(arm.starts),
         "task": arm.env["task"],
-        "instruction": perturbation.told(task).instruction,
+        "instruction": told_in(arm.env),
         "demonstrations": arm.demonstrations and arm.demonstrations.name,
     }

@@ -62,10 +62,12 @@ def test_weights_of_one_commit_on_the_hub_are_plain_data():
     policy = recipe["variants"]["ours"]["policy"]
     policy |= {"pretrained_path": "lerobot/smolvla_base", "pretrained_revision": "0a" * 20}
     check_plain(recipe)
-    assert starts_from(recipe) == f"lerobot/smolvla_base@{'0a' * 20}" and not starts_from(RECIPE)
+    assert starts_from(policy) == f"lerobot/smolvla_base@{'0a' * 20}"
+    assert not starts_from(RECIPE["variants"]["ours"]["policy"])
     encoder = f"hf/ada/encoder@{'0a' * 20}"
     check_plain(named := json.loads(json.dumps(RECIPE).replace("efficientnet_lite0", encoder)))
-    assert starts_from(named) == encoder
+    assert starts_from(named["variants"]["ours"]["policy"]) == encoder
+    check_plain({"variants": {"policy": {"data": "precise/tile_to_grid", "policy": {"type": "act"}}}})
     for changed in (
         {"pretrained_path": "../smolvla_base"},
         {"pretrained_path": "a/b/c"},
@@ -131,7 +133,7 @@ def test_an_honest_entry_is_the_same_and_a_forged_one_is_told(made, tmp_path):
 
     submission = read_submission(shutil.copytree(entry, tmp_path / "board" / "entries" / "mine"))
     call("constructskill-recover", f"--root={tmp_path / 'board'}")
-    recovered = read_recovered(path_of(tmp_path / "board", "mine"), submission.sha256).values()
+    recovered = read_recovered(path_of(tmp_path / "board", "mine"), submission.sha256).rows.values()
     assert {row.key for row in recovered} == {claim.key for claim in submission.claims if not claim.placed}
     assert Lost.UNSEEN not in {row.lost for row in recovered}, "replay, recovery and retraining agree"
 

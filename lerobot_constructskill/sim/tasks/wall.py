@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Actor
 
 from lerobot_constructskill.contract import PLAN_TASK, SHIPPED
 from lerobot_constructskill.plans.check import check_plan
-from lerobot_constructskill.plans.plan import Kind, Plan, Position, read_plan, supplies
+from lerobot_constructskill.plans.plan import WAITS_WITHIN, Kind, Plan, Position, read_plan, supplies
 from lerobot_constructskill.sim.actions import Hold
 from lerobot_constructskill.sim.scene import FINGER_OPEN, LIFT_HEIGHT, PickPlaceEnv
 from lerobot_constructskill.sim.strict import DEPTH_TOLERANCE, fits
@@ -51,7 +51,7 @@ class WallEnv(PickPlaceEnv):
         InputError: it is no plan, or cannot be built.
     """
 
-    spawn_range = 0.03
+    spawn_range = WAITS_WITHIN
     yaw_range = 0.0
     yaw_tolerance = np.radians(3.0)
     hold = Hold(yaw=True)
