@@ -47,6 +47,8 @@ class Part:
 
     def is_whole(self, folder: Path) -> bool:
         """Whether each of its runs has failed, or what it executed is kept."""
+        if not (folder / ROWS).is_file():
+            return False
         rows = self.rows(folder)
         finished = rows[rows["error_kind"].isna()]
         return (

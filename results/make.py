@@ -14,6 +14,7 @@ entries that are made of studies (`entries.py`) are written and committed with t
 import subprocess
 import time
 from argparse import RawDescriptionHelpFormatter
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -36,7 +37,7 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import ROWS, Draws, Row, load_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Draws, Row, load_rows
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
@@ -68,6 +69,10 @@ BULKY = ("demonstrations", "features", "rounds", "dagger")
 """Kinds of nodes that can be removed once their runs are made: the features of a draw take 12 GB."""
 
 
+type Name = tuple[str, str, int]
+"""Setting, variant and training seed of a run."""
+
+
 @dataclass(frozen=True)
 class Piece:
     """What is made and committed at once.
@@ -85,6 +90,10 @@ class Piece:
     @property
     def only(self) -> str:
         return ",".join(run.id for run in self.runs)
+
+    @property
+    def names(self) -> set[Name]:
+        return {(run.arm.setting, run.arm.name, run.seed) for run in self.runs}
 
 
 def pieces_of(name: str, study: Study) -> Iterator[Piece]:
@@ -170,38 +179,36 @@ class Maker:
 
         They are not where a process was killed before that.
         """
-        folder = self.folder(piece.study)
-        if self._due_entries(piece.study):
-            return False
-        if not self._git("status", "--porcelain", "--", folder):
-            return True
-        names = {(run.arm.setting, run.arm.name, run.seed) for run in piece.runs}
-        now, before = (
-            [row for row in rows if (row.setting, row.variant, row.training_seed) in names]
-            for rows in (load_rows(folder / ROWS), self._committed(folder / ROWS))
-        )
-        return now == before
+        return not self._due_entries(piece.study) and not piece.names & self._uncommitted(piece.study)
 
     def _due_entries(self, study: str) -> list[str]:
         return [name for name in whole(self.folder(study), study) if name not in self._refused]
 
-    def _committed(self, file: Path) -> list[Row]:
-        """The rows of a study in the last commit."""
-        name = file.relative_to(self.root).as_posix()
-        if not self._git("ls-tree", "HEAD", "--", file):
-            return []
+    def _uncommitted(self, study: str) -> set[Name]:
+        """The runs of a study whose rows are in no commit."""
+        file = self.folder(study) / ROWS
+        if not file.is_file() or not self._git("status", "--porcelain", "--", file):
+            return set()
+        now = _by_run(load_rows(file))
         with TemporaryDirectory() as scratch:
             copy = Path(scratch) / file.name
-            copy.write_bytes(self._output("show", f"HEAD:{name}"))
-            return load_rows(copy)
+            copy.write_bytes(self._committed(file))
+            before = _by_run(load_rows(copy)) if copy.stat().st_size else {}
+        return {run for run, rows in now.items() if before.get(run) != rows and rows[0].error_kind != NOT_RUN}
+
+    def _committed(self, file: Path) -> bytes:
+        """A file as it is in the last commit; nothing if it is not there."""
+        if not self._git("ls-tree", "HEAD", "--", file):
+            return b""
+        return self._output("show", f"HEAD:{file.relative_to(self.root).as_posix()}")
 
     def make(self, piece: Piece) -> None:
         """Make what is missing of a piece, write its pages and commit them.
 
         Raises:
-            InputError: the sources have edits that are in no commit.
+            InputError: git could not commit it, or would commit with it what something else has written.
         """
-        self._check_sources()
+        self._check(piece)
         config, folder = self.configs[piece.study], self.folder(piece.study)
         folder.mkdir(parents=True, exist_ok=True)
         options = Options(only=piece.only, replace=True, **self.options)
@@ -246,9 +253,28 @@ class Maker:
     def _pages(self) -> list[Path]:
         return [self.root / page.relative_to(ROOT) for page in PAGES]
 
-    def _check_sources(self) -> None:
+    def _check(self, piece: Piece) -> None:
+        """Refuse, before the hours that a piece takes, what would spoil its commit."""
+        self._git("var", "GIT_COMMITTER_IDENT")
+        if not self._git("branch", "--show-current"):
+            raise InputError(
+                "No branch is checked out, so that commits would be lost: `git switch -c NAME` makes one."
+            )
+        if (self.root / self._git("rev-parse", "--git-path", "MERGE_HEAD").strip()).exists():
+            raise InputError("A merge is going on: finish it first (`git status`).")
         if edited := self._git("status", "--porcelain", "--", *SOURCES).splitlines():
             raise InputError(f"Commit your edits first, so that a commit makes the rows again: {edited[0][3:]}")
+        for page in self._pages:
+            now, before = page.read_text(encoding="utf-8"), self._committed(page).decode()
+            if now not in (before, render(page, before)):  # the latter is what a killed process leaves
+                raise InputError(f"Commit your edits first: {page.relative_to(self.root)} is committed with the rows.")
+        for study in self.configs:
+            waiting = self._uncommitted(study) - piece.names
+            if other := next((one for one in self.every if one.study == study and one.names & waiting), None):
+                raise InputError(
+                    f"{other.name} has rows that are in no commit. Make it first (`--only={other.name}`), or throw "
+                    f"them away (`git restore results/{study}`)."
+                )
 
     def _commit(self, message: str, *paths: Path) -> None:
         self._git("add", "--all", "--", *paths)
@@ -259,8 +285,24 @@ class Maker:
         return self._output(*arguments).decode()
 
     def _output(self, *arguments) -> bytes:
-        """What git prints."""
-        return subprocess.run(["git", "-C", self.root, *arguments], check=True, capture_output=True).stdout
+        """What git prints.
+
+        Raises:
+            InputError: it refuses, with its reason.
+        """
+        done = subprocess.run(["git", "-C", self.root, *arguments], check=False, capture_output=True)
+        if done.returncode:
+            said = done.stderr.decode(errors="replace").strip()
+            reason = next((line for line in said.splitlines() if line.startswith(("fatal: ", "error: "))), said)
+            raise InputError(f"`git {arguments[0]}` refuses: {reason.partition(': ')[2] or reason}")
+        return done.stdout
+
+
+def _by_run(rows: Iterable[Row]) -> dict[Name, list[Row]]:
+    found: dict[Name, list[Row]] = defaultdict(list)
+    for row in rows:
+        found[row.setting, row.variant, row.training_seed].append(row)
+    return found
 
 
 def _bulky(nodes: Sequence[Node]) -> set[Node]:
@@ -300,6 +342,7 @@ def main() -> None:
     if asked.status:
         say(maker.status(pieces))
         return
+    say(maker.status(pieces).splitlines()[-1])
     if asked.discard:
         maker.discard()
     for piece, runs in maker.due(pieces):

@@ -7,7 +7,7 @@ column by its head (`HEADS`). A link whose title begins with one of `WORDS` has 
     | `light` | [500](report.md "placed light_1/precise") | [500](report.md "placed light_2/precise") |
 
 The name of one of the study's `means` may stand in place of a setting: each seed that ran in all of its settings is
-then counted once, with the episodes of all of them.
+then counted once, with the episodes of all of them. A draw counts once all of its seeds are there.
 """
 
 import json
@@ -49,7 +49,7 @@ class Arm:
         name: setting/variant, or mean/variant.
 
     Raises:
-        SystemExit: the study has no such arm, or a run of a mean failed.
+        SystemExit: the study has no such arm.
     """
 
     def __init__(self, rows: pd.DataFrame, draws: Draws, means: dict[str, list[str]], name: str):
@@ -59,20 +59,17 @@ class Arm:
         if {*own["setting"]} != {*settings}:
             raise SystemExit(f"A page names {name}, which its study does not have.")
         runs = runs_of(own)
-        if len(settings) > 1 and runs["episodes"].nunique() > 1:
-            raise SystemExit(f"A page names {name}, whose runs have different numbers of episodes.")
-        self.runs = _over(runs, len(settings))
+        runs["episodes"] = runs["episodes"].max()  # a failed one did none of them
+        runs = _over(runs, len(settings))
+        units = runs["training_seed"].map(draws.unit)
+        whole = units.map(units.value_counts()) == (draws.seeds_a_draw if draws.groups_seeds else 1)
+        self.runs = runs[whole].reset_index(drop=True)
         self.rows = own[own["training_seed"].isin(self.runs["training_seed"])]
         self.draws, self.units = (self.runs["training_seed"].map(of) for of in (draws.of, draws.unit))
-        if self.units.value_counts().nunique() > 1:  # a count of all would not be what the mean over draws says
-            raise SystemExit(f"A page names {name}, some of whose draws lack a seed: make these first.")
-
-    def tell(self, number: Callable[["Arm"], str]) -> str:
-        return "not run yet" if self.runs.empty else number(self)
 
     def met(self, criterion: str) -> str:
         """Its episodes that did, of all; one of a failed seed did not."""
-        return f"{self.runs[criterion].sum()}/{len(self.runs) * self.runs['episodes'].max()}"
+        return f"{self.runs[criterion].sum()}/{self.runs['episodes'].sum()}"
 
     def rates(self, criterion: str) -> np.ndarray:
         """The share of each seed or, where several share a draw, of each draw."""
@@ -152,13 +149,17 @@ HEADS: dict[str, Callable[[Arm], str]] = {
 """Of columns."""
 
 
-def render(page: Path) -> str:
+def render(page: Path, text: str | None = None) -> str:
     """A page with the numbers that the rows have now.
 
+    Args:
+        page: the file.
+        text: of the page, if not as it lies there.
+
     Raises:
-        SystemExit: a link names an arm that its study does not have.
+        SystemExit: a link names a study, or an arm of one, that there is not.
     """
-    return "".join(f"{text}\n" for text, _, _ in _lines(page))
+    return "".join(f"{line}\n" for line, _, _ in _lines(page, text))
 
 
 def literals(page: Path) -> list[str]:
@@ -172,27 +173,47 @@ def literals(page: Path) -> list[str]:
     return found
 
 
-def _lines(page: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+def _lines(page: Path, text: str | None = None) -> Iterator[tuple[str, list[str], list[str]]]:
     """Each line as rendered; if it is one of a table, the table's heads and its cells."""
     heads: list[str] = []
-    study = cache(lambda folder: (read_rows(folder / ROWS), read_draws(folder), read_means(folder)))
-    arms = cache(lambda file, name: Arm(*study((page.parent / file).resolve().parent), name))
-    for line in page.read_text(encoding="utf-8").splitlines():
+    study = cache(_study)
+
+    @cache
+    def arms(file: str, name: str) -> Arm | None:
+        own = study((page.parent / file).resolve().parent)
+        return Arm(*own, name) if own else None
+
+    for line in (page.read_text(encoding="utf-8") if text is None else text).splitlines():
         cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
         heads = (heads or cells) if cells else []
         if cells and (row := next((one for one in LINK.finditer(line) if one["word"] is None), None)):
             arm = arms(row["file"], row["arm"])
-            cells = [arm.tell(HEADS[head]) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)]
+            cells = [
+                _tell(arm, HEADS[head]) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)
+            ]
             line = f"| {' | '.join(cells)} |"
         yield LINK.sub(lambda one: _linked(one, arms), line), heads, cells
 
 
-def _linked(link: re.Match[str], arms: Callable[[str, str], Arm]) -> str:
+def _study(folder: Path) -> tuple[pd.DataFrame, Draws, dict[str, list[str]]] | None:
+    """The rows of a study, its draws and its means; None if it has no rows yet."""
+    if (folder / ROWS).is_file():
+        return read_rows(folder / ROWS), read_draws(folder), read_means(folder)
+    if not (ROOT / "configs" / "study" / f"{folder.name}.yaml").is_file():
+        raise SystemExit(f"A page names {folder.name}, which is no study.")
+    return None
+
+
+def _tell(arm: Arm | None, number: Callable[[Arm], str]) -> str:
+    return "not run yet" if arm is None or arm.runs.empty else number(arm)
+
+
+def _linked(link: re.Match[str], arms: Callable[[str, str], Arm | None]) -> str:
     """A link with its number as its text; one of a row of a table as it is."""
     arm = arms(link["file"], link["arm"])
     if link["word"] is None:
         return link[0]
-    text = arm.tell(WORDS[link["word"]])
+    text = _tell(arm, WORDS[link["word"]])
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
 
 

@@ -358,7 +358,7 @@ def drawn_episodes(rng, draws, seeds, starts, deviations):
 @pytest.mark.parametrize("deviations", [(0.15, 0.03, 0.1), (0.03, 0.15, 0.1), (0.1, 0.1, 0.0)])
 def test_the_spread_is_split_as_an_analysis_of_variance_splits_it(deviations, rng):
     """Its mean squares give the same where every draw has as many seeds and starts (Searle et al. 1992)."""
-    draws, seeds, starts = shape = 30, 4, 40
+    draws, seeds, starts = shape = 24, 4, 24
     episodes = drawn_episodes(rng, *shape, deviations)
     met = episodes["met"].to_numpy(float).reshape(shape)
     of_draws, of_seeds, of_starts = met.mean((1, 2)), met.mean(2), met.mean(1)
@@ -391,7 +391,7 @@ def test_intervals_over_ten_draws_cover_what_they_should(rng):
 
 def test_an_interval_over_draws_that_vary_most_is_that_of_a_variance_of_so_many_numbers(rng):
     """Of ten, half to twice as much; of two, next to nothing is known."""
-    ten, two = (split(drawn_episodes(rng, draws, 3, 200, (0.2, 0.0, 0.0))).draws for draws in (10, 2))
+    ten, two = (split(drawn_episodes(rng, draws, 3, 60, (0.2, 0.0, 0.0))).draws for draws in (10, 2))
     assert [ten.low / ten.value, ten.high / ten.value] == pytest.approx([0.69, 1.83], abs=0.04)  # chi-squared, 9
     assert two.high > 0.5, "which a report calls not determined"
 

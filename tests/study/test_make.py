@@ -1,6 +1,7 @@
 """`make results`: pieces are made once, committed one by one, and go on elsewhere; so do entries of the board."""
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -220,6 +221,59 @@ def test_nothing_is_made_of_sources_that_are_in_no_commit(checkout, tmp_path, ma
         maker.make(maker.pieces()[0])
     with pytest.raises(InputError, match="--only=huge fits no piece; the first one is tiny/one"):
         maker.pieces("huge")
+
+
+def test_what_would_spoil_a_commit_is_refused_before_the_hours_that_a_piece_takes(
+    checkout, tmp_path, made, monkeypatch
+):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    one, _, two = maker.pieces()
+    monkeypatch.setattr(made, "run_study", lambda *_: pytest.fail("it works for hours"))
+    readme = checkout / "README.md"
+    readme.write_text("Half a sentence of somebody's\n")
+    with pytest.raises(InputError, match=r"Commit your edits first: README.md"):
+        maker.make(one)
+    git(checkout, "restore", "README.md")
+    git(checkout, "checkout", "--quiet", "--detach")
+    with pytest.raises(InputError, match="No branch is checked out"):
+        maker.make(one)
+    git(checkout, "switch", "--quiet", "-")
+    (checkout / ".git" / "MERGE_HEAD").write_text(git(checkout, "rev-parse", "HEAD"))
+    with pytest.raises(InputError, match="A merge is going on"):
+        maker.make(one)
+    (checkout / ".git" / "MERGE_HEAD").unlink()
+    with (
+        monkeypatch.context() as anonymous,
+        pytest.raises(InputError, match="`git var` refuses: .*no email was given"),
+    ):
+        anonymous.setenv("GIT_CONFIG_KEY_0", "user.useConfigOnly")
+        anonymous.setenv("GIT_CONFIG_VALUE_0", "true")
+        anonymous.setenv("GIT_CONFIG_GLOBAL", "/dev/null")
+        anonymous.setenv("GIT_CONFIG_COUNT", "1")
+        maker.make(one)
+
+
+def test_rows_of_another_piece_are_not_committed_half_made(checkout, tmp_path, made, monkeypatch):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    one, _, two = maker.pieces()
+    with monkeypatch.context() as killed, pytest.raises(SystemExit):
+        killed.setattr(maker, "_commit", lambda *_: sys.exit("killed"))
+        maker.make(two)
+    with pytest.raises(InputError, match=r"tiny/two has rows that are in no commit.*git restore results/tiny"):
+        maker.make(one)
+    maker.make(two)
+    maker.make(one)
+    assert git(checkout, "log", "-2", "--format=%s").splitlines() == ["Results: tiny/one", "Results: tiny/two"]
+
+
+def test_a_folder_that_somebody_removed_is_made_anew(checkout, tmp_path, made):
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    one, _, two = maker.pieces()
+    maker.make(one)
+    shutil.rmtree(checkout / "results/tiny")
+    for piece in (two, one):
+        maker.make(piece)
+    assert all(map(maker.is_committed, (one, two)))
 
 
 def test_what_no_piece_needs_any_more_can_be_removed(checkout, tmp_path, made):

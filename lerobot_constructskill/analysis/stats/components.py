@@ -34,7 +34,7 @@ def split(episodes: pd.DataFrame) -> Components | None:
     A linear model of outcomes that are 0 or 1 gives components in points, which add up; those of a logistic one have
     no such meaning. The intervals are Satterthwaite's (Biometrics Bulletin 2, 1946): chi-squared, with the degrees of
     freedom that the standard error of a variance stands for. They are wide over few draws, and 0 to infinity where a
-    component is estimated as 0.
+    component is estimated as 0 or so near to it that they do not hold.
 
     Args:
         episodes: a row an episode: `draw`, `training_seed`, `evaluation_seed` and whether it succeeded, `met`.
@@ -82,8 +82,11 @@ def _deviations(fit: MixedLMResults, parts: list[str]) -> dict[str, Estimate]:
 
 def _deviation(variance: float, error: float) -> Estimate:
     """The root of a variance with this standard error, and its interval."""
-    if variance <= 0 or not np.isfinite(error):
-        return Estimate(float(np.sqrt(max(variance, 0))), 0.0, float("inf"))
-    freedom = 2 * (variance / error) ** 2
-    low, high = (float(np.sqrt(variance * freedom / chi2.ppf(level, freedom))) for level in (0.975, 0.025))
-    return Estimate(float(np.sqrt(variance)), low, high)
+    value = float(np.sqrt(max(variance, 0)))
+    if variance > 0 and np.isfinite(error):
+        freedom = 2 * (variance / error) ** 2
+        with np.errstate(divide="ignore"):  # next to no degree of freedom
+            low, high = value * np.sqrt(freedom / chi2.ppf([0.975, 0.025], freedom))
+        if low <= value:
+            return Estimate(value, float(low), float(high))
+    return Estimate(value, 0.0, float("inf"))
