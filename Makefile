@@ -66,10 +66,10 @@ image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BA
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
-release: ## wheel, source distribution, site, and what goes to the Hub under HUB=NAME (results/release.py uploads it)
+release: ## wheel, source distribution, site, and what goes to the Hub under HUB=NAME (DRAFT=1 while results are missing)
 	@test '$(HUB)' || { echo "Name the user or organisation on the Hub: make release HUB=NAME" >&2; exit 2; }
 	@$(MAKE) --no-print-directory dist docs
-	.venv/bin/python results/release.py --user=$(HUB)
+	.venv/bin/python results/release.py --user=$(HUB) $(if $(DRAFT),--draft)
 
 pins: ## resolve pyproject.toml afresh into constraints.txt, for x86-64 Linux and Python 3.12
 	PATH="$$PWD/.venv-uv/bin:$$PATH" uv pip compile pyproject.toml --quiet --upgrade --all-extras --python-version 3.12 \

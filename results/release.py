@@ -1,7 +1,8 @@
 """What a release has on the Hub: data sets, checkpoints, and the site with the board, each with its page.
 
-    python results/release.py --user=NAME    # writes all of it to outputs/hub, for you to look at
-    python results/release.py --push         # uploads what lies there; interrupted, the same command continues
+    python results/release.py --user=NAME            # writes all of it to outputs/hub, for you to look at
+    python results/release.py --user=NAME --draft    # the same while results are missing; it cannot be uploaded
+    python results/release.py --push                 # uploads what lies there; killed, the same command continues
 
 `make release HUB=NAME` does the first, after the wheel, the source distribution and the site. Data sets and
 checkpoints come from the store of `make results`. What it lacks is made: minutes for a set, half an hour for the
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from huggingface_hub import HfApi
+from make import Maker
 
 from lerobot_constructskill.analysis.stats.outcomes import runs_of
 from lerobot_constructskill.artifacts.digests import file_sha256
@@ -25,7 +27,7 @@ from lerobot_constructskill.artifacts.store import Machine, Store
 from lerobot_constructskill.dataset.hub import hub_errors
 from lerobot_constructskill.demos.node import Demonstrations
 from lerobot_constructskill.demos.settings import GenerateConfig
-from lerobot_constructskill.errors import InputError, MissingError, TakenError
+from lerobot_constructskill.errors import InputError, MissingError, TakenError, plural
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse, parse_named
@@ -64,6 +66,7 @@ FILE = "release.json"
 class _Release(TypedDict):
     user: str
     tag: str
+    draft: bool
 
 
 RELEASE = Json("what says whose a release is", _Release)
@@ -74,7 +77,7 @@ def called(name: str) -> str:
     return "constructskill_" + name.replace("/", "_")
 
 
-def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> None:
+def write(out: Path, user: str, store: Store, site: Path, machine: Machine, draft: bool = False) -> None:
     """Write `datasets`, `models` and `spaces`, with a folder for each repository, to a folder that appears whole.
 
     Args:
@@ -82,24 +85,31 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
         user: whose repositories they are.
         store: where `make results` works.
         site: where `make docs` built the site.
+        draft: whether results may be missing or of older code.
 
     Raises:
         MissingError: the site was not built.
         TakenError: something else is in the way.
-        InputError: a checkpoint is not the one that the published rows are of.
+        InputError: results are missing, or a checkpoint is not the one that the published rows are of.
     """
     if not (site / "index.html").is_file():
         raise MissingError(f"{site} has no index.html: `make docs` builds the site.")
     if out.exists() and not (out / FILE).is_file():
         raise TakenError(f"{out} exists already, and is no release: move it away.")
-    release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}")
+    if (left := _left(store)) and not draft:
+        raise InputError(
+            f"{plural(left, 'piece')} of the results are missing, or made by older code: `make results` makes them. "
+            "--draft writes a release without them, which cannot be uploaded."
+        )
+    release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}", draft=left > 0)
     sets = {
         name: Demonstrations(parse_named(GenerateConfig, "generate", name, ["--repo_id=local/set"])) for name in SETS
     }
     runs = {data: _runs(study, arm) for data, (study, arm) in POLICIES.items()}
     sets |= {data: own[0].arm.demonstrations.node for data, own in runs.items()}
-    made = {name: store.get(node, machine) for name, node in sets.items()}
+    # First what another kind of processor would make otherwise.
     policies = {data: _Policies(study, runs[data], store, machine) for data, (study, _) in POLICIES.items()}
+    made = {name: store.get(node, machine) for name, node in sets.items()}
     if out.exists():
         shutil.rmtree(out)
     with staged(out) as folder:
@@ -112,6 +122,12 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine) -> N
         shutil.copytree(site, folder / "spaces" / "constructskill")
         write_text(folder / "spaces" / "constructskill" / "README.md", SPACE)
         write_text(folder / FILE, json.dumps(release) + "\n")
+
+
+def _left(store: Store) -> int:
+    """The number of pieces of the published results that `make results` would make."""
+    maker = Maker(ROOT, store.root)
+    return sum(bool(runs) for _, runs in maker.due(maker.every))
 
 
 def _runs(study: str, arm: str) -> list[Run]:
@@ -149,8 +165,20 @@ class _Policies:
         for run, checkpoint in self._checkpoints.items():
             root = folder / f"{called(self._study)}_{run.id.replace('/', '_')}"
             shutil.copytree(checkpoint, root)
-            task, train = self._arm.env["task"], {"seed": run.seed, "dataset": learned}
-            write_text(root / "README.md", card_of(root, f"{user}/{root.name}", outcomes, task, train))
+            train = {"seed": run.seed, "dataset": learned}
+            card = card_of(root, f"{user}/{root.name}", outcomes, self._arm.env["task"], train, self._flags)
+            write_text(
+                root / "README.md", f"{card}\nDocumentation and leaderboard: the Space `{user}/constructskill`.\n"
+            )
+
+    @property
+    def _flags(self) -> str:
+        """What `lerobot-eval` needs to run the episodes of the published rows."""
+        env, starts = self._arm.env, self._arm.starts
+        return (
+            f"--env.obs_type={env['obs_type']} --env.episode_length={env['episode_length']} --seed={starts[0]} "
+            f"--eval.n_episodes={len(starts)} --eval.batch_size=1"
+        )
 
 
 def push(out: Path) -> None:
@@ -158,18 +186,16 @@ def push(out: Path) -> None:
 
     Raises:
         MissingError: none was written.
-        InputError: a check found something wrong with a data set.
+        InputError: it is a draft, or a check found something wrong with a data set.
         OSError: the Hub refused, or the connection broke.
     """
     if not (out / FILE).is_file():
         raise MissingError(f"{out} holds no release: `make release HUB=NAME` writes one.")
     release, api = RELEASE.read(out / FILE), HfApi()
-    for root in sorted(out.glob("datasets/*")):
-        try:
-            say(push_dataset(PushConfig(f"{release['user']}/{root.name}", root, tag=release["tag"])))
-        except TakenError as error:
-            say(str(error))
-    for kind, files, options in (("model", [*PUSHED, "README.md"], {}), ("space", None, {"space_sdk": "static"})):
+    if release["draft"]:
+        raise InputError(f"{out} holds a draft: results are missing in it. `make release HUB=NAME` writes a release.")
+    kinds = {"dataset": (None, {}), "model": ([*PUSHED, "README.md"], {}), "space": (None, {"space_sdk": "static"})}
+    for kind, (files, options) in kinds.items():
         for root in sorted(out.glob(f"{kind}s/*")):
             repo = {"repo_id": f"{release['user']}/{root.name}", "repo_type": kind}
             with hub_errors(repo["repo_id"]):
@@ -177,8 +203,11 @@ def push(out: Path) -> None:
                 if release["tag"] in {tag.name for tag in api.list_repo_refs(**repo).tags}:
                     say(f"'{repo['repo_id']}' holds {release['tag']} already")
                     continue
-                api.upload_folder(**repo, folder_path=root, allow_patterns=files, delete_patterns="*")
-                api.create_tag(**repo, tag=release["tag"])
+                if kind != "dataset":
+                    api.upload_folder(**repo, folder_path=root, allow_patterns=files, delete_patterns="*")
+                    api.create_tag(**repo, tag=release["tag"])
+            if kind == "dataset":
+                push_dataset(PushConfig(repo["repo_id"], root, tag=release["tag"], update=True))
             say(f"Pushed: {repo['repo_id']}")
 
 
@@ -188,6 +217,7 @@ def main() -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--user", help="write it for this user or organisation on the Hub")
     what.add_argument("--push", action="store_true", help="upload it")
+    parser.add_argument("--draft", action="store_true", help="write it although results are missing")
     parser.add_argument("--out", type=Path, default=ROOT / "outputs" / "hub", help="where it is written")
     parser.add_argument("--store", type=Path, default=ROOT / "outputs" / "store", help="where runs are made")
     parser.add_argument("--site", type=Path, default=ROOT / "outputs" / "site", help="where the site was built")
@@ -197,7 +227,7 @@ def main() -> None:
         push(asked.out)
         return
     load_plugins()
-    write(asked.out, asked.user, Store(asked.store.absolute()), asked.site, Machine(asked.workers))
+    write(asked.out, asked.user, Store(asked.store.absolute()), asked.site, Machine(asked.workers), asked.draft)
     say(f"{asked.out} holds the release: look at it, then `python results/release.py --push`")
 
 

@@ -81,12 +81,17 @@ def seed_outcomes(folder: Path) -> list[tuple[int, int, int, int]]:
 
 
 def card_of(
-    checkpoint: Path, repo_id: str, outcomes: list[tuple[int, int, int, int]], task: str, train: Mapping[str, Any]
+    checkpoint: Path,
+    repo_id: str,
+    outcomes: list[tuple[int, int, int, int]],
+    task: str,
+    train: Mapping[str, Any],
+    flags: str = "",
 ) -> str:
     """The card of a policy in a folder, as `render_card` makes it."""
     record = checkpoint / "encoder.json"
     encoder = OBJECT.read(record) if record.is_file() else {}
-    return render_card(repo_id, outcomes, task, train, OBJECT.read(checkpoint / "config.json"), encoder)
+    return render_card(repo_id, outcomes, task, train, OBJECT.read(checkpoint / "config.json"), encoder, flags)
 
 
 def render_card(
@@ -96,6 +101,7 @@ def render_card(
     train: Mapping[str, Any],
     policy: dict[str, Any],
     encoder: dict[str, Any],
+    flags: str = "",
 ) -> str:
     """The card of a policy, in Markdown.
 
@@ -103,6 +109,7 @@ def render_card(
         train: `train_config.json` (`TRAINED`).
         policy: the checkpoint's `config.json`.
         encoder: its `encoder.json`; empty for a policy without one.
+        flags: what `lerobot-eval` needs beside the policy and the task; "" where they are not known.
     """
     data = train.get("dataset", {})
     return render_template(
@@ -115,4 +122,5 @@ def render_card(
         revision=data.get("revision"),
         policy=policy,
         encoder=encoder,
+        flags=flags,
     )

@@ -29,6 +29,7 @@ def release(monkeypatch):
     import release
 
     monkeypatch.setattr(release, "SETS", ())
+    monkeypatch.setattr(release, "_left", lambda store: 0)
     return release
 
 
@@ -46,7 +47,7 @@ def write(release, demonstrations, tmp_path, monkeypatch):
     monkeypatch.setattr(
         Store, "get", lambda store, node, machine: demonstrations if node.kind == "demonstrations" else checkpoints
     )
-    return lambda out: release.write(out, "alice", Store(tmp_path / "store"), site, Machine())
+    return lambda out, **options: release.write(out, "alice", Store(tmp_path / "store"), site, Machine(), **options)
 
 
 @pytest.fixture
@@ -66,6 +67,15 @@ def test_weights_that_the_rows_are_not_of_are_refused_and_nothing_is_left(write,
     assert not (tmp_path / "hub").exists()
 
 
+def test_results_that_are_missing_are_in_no_release(write, as_published, tmp_path, release, monkeypatch):
+    monkeypatch.setattr(release, "_left", lambda store: 3)
+    with pytest.raises(InputError, match="3 pieces of the results are missing"):
+        write(tmp_path / "hub")
+    write(tmp_path / "hub", draft=True)
+    with pytest.raises(InputError, match="holds a draft"):
+        release.push(tmp_path / "hub")
+
+
 def test_what_is_no_release_stays(write, as_published, tmp_path, release):
     (tmp_path / "hub").mkdir()
     with pytest.raises(TakenError, match="exists already"):
@@ -74,7 +84,7 @@ def test_what_is_no_release_stays(write, as_published, tmp_path, release):
         release.push(tmp_path / "hub")
 
 
-def test_a_release_is_written_and_pushed_and_a_second_push_changes_nothing(write, as_published, tmp_path):
+def test_a_release_is_pushed_once_and_the_next_version_takes_its_place(write, as_published, tmp_path):
     out = tmp_path / "hub"
     write(out)
     (out / "models" / "of_yesterday").mkdir()
@@ -82,21 +92,28 @@ def test_a_release_is_written_and_pushed_and_a_second_push_changes_nothing(write
     with serve() as hub:
         env = {**os.environ, "HF_ENDPOINT": hub.url, "HF_HOME": str(tmp_path / "home"), "HF_TOKEN": next(iter(TOKENS))}
         env |= {"HF_HUB_DISABLE_XET": "1", "HF_HUB_OFFLINE": "0"}
-        for _ in range(2):
-            push = [sys.executable, str(RESULTS / "release.py"), "--push", f"--out={out}"]
-            told = subprocess.run(push, env=env, capture_output=True, text=True, check=False)
+
+        def push() -> str:
+            command = [sys.executable, str(RESULTS / "release.py"), "--push", f"--out={out}"]
+            told = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
             assert not told.returncode, told.stderr
-            held = {name: repo.commits[repo.branches["main"]] for name, repo in hub.repos.items()}
-    assert "constructskill_precise_brick_to_bin_shifted' holds a data set already" in told.stdout
-    assert told.stdout.count(f"holds {TAG} already") == 11 and "Pushed" not in told.stdout
+            return told.stdout
+
+        assert push().count("Pushed: alice/") == 12
+        held = {name: repo.commits[repo.branches["main"]] for name, repo in hub.repos.items()}
+        again = push()
+        assert again.count(f"holds {TAG} already") == 12 and "Pushed" not in again
+        (out / "release.json").write_text(json.dumps({"user": "alice", "tag": "v99", "draft": False}))
+        assert push().count("Pushed: alice/") == 12
+        assert all(repo.tags.keys() >= {TAG, "v99"} for repo in hub.repos.values())
+        assert all(repo.tags["v99"] == repo.branches["main"] for repo in hub.repos.values())
     policies = [f"models/alice/constructskill_precise_brick_to_bin_shifted_precise_seed_{seed}" for seed in range(10)]
     data = "datasets/alice/constructskill_precise_brick_to_bin_shifted"
     assert {*hub.repos} == {data, "spaces/alice/constructskill", *policies}
-    assert all(TAG in repo.tags for repo in hub.repos.values())
     assert hub.blobs[held["spaces/alice/constructskill"]["index.html"][0]] == b"the board"
     assert "sdk: static" in hub.blobs[held["spaces/alice/constructskill"]["README.md"][0]].decode()
     assert {*held[policies[7]]} == {"README.md", "config.json", "model.safetensors"}
     card = hub.blobs[held[policies[7]]["README.md"][0]].decode()
     assert "| 7 (this one) | " in card and card.count("/50 |") == 20, "lifted and placed of all ten seeds"
     assert f"Trained on `alice/constructskill_precise_brick_to_bin_shifted`, revision `{TAG}`" in card
-    assert json.loads((out / "release.json").read_text()) == {"user": "alice", "tag": TAG}
+    assert "--env.episode_length=300 --seed=5000 --eval.n_episodes=50" in card and "Space `alice/construct" in card
