@@ -5,6 +5,7 @@ machine to machine. When all of it is there, the entry is written and replayed, 
 """
 
 import json
+import re
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -149,6 +150,7 @@ def _write(entry: Part, folder: Path, before: Declaration, commit: str, root: Pa
         "revision": f"study {entry.study} of results/{entry.study}, variant {entry.variant}, commit {commit}",
         "compute": f"2 cores of {' and '.join(processors)}, no GPU",
     }
+    said["policy"] = re.sub(r" in (bfloat16|float32)", "", before.about.policy)  # that of the processors before
     about = from_recordings.with_draws(replace(before.about, **said), folder)
     recorded = from_recordings.recorded_by_study(folder, folder / KEPT, entry.variant, settings, entry.settings)
     made = from_recordings.trained_by_study(folder, entry.variant, settings, entry.settings)

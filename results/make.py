@@ -172,7 +172,11 @@ class Maker:
     def times(self) -> Estimates:
         """How long runs take, by what is in the folders of all studies now."""
         folders = {study: self.folder(study) for study in self.configs}
-        return Estimates(folders, {name: config.study.episodes for name, config in self.configs.items()}, self.store)
+        runs = {
+            study: [run for piece in self.every if piece.study == study for run in piece.runs]
+            for study in self.configs
+        }
+        return Estimates(folders, runs, self.store)
 
     def is_committed(self, piece: Piece) -> bool:
         """Whether its rows are in a commit, and no entry of its study waits to be written.

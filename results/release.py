@@ -43,7 +43,7 @@ from lerobot_constructskill.training.checkpoints import checkpoint_of
 
 ROOT = Path(__file__).parents[1]
 
-SETS = ("paper", "fast", "precise/brick_to_bin_shifted", "suite/orders")
+SETS = ("direct", "fast", "precise/brick_to_bin_shifted", "suite/orders")
 """Data sets, as `constructskill-generate` calls them."""
 
 POLICIES = {"precise/brick_to_bin_shifted": ("precise", "brick_to_bin_shifted/precise")}

@@ -17,6 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import pandas as pd
@@ -25,13 +26,13 @@ from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, by_unit, chance_of, count, runs_of
 from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_means, read_rows
+from lerobot_constructskill.study.timing import STAGES, entries
 
 ROOT = Path(__file__).parents[1]
 
 PAGES = [
     ROOT / "README.md",
-    ROOT / "docs" / "policies.md",
-    ROOT / "docs" / "results.md",
+    *(ROOT / "docs" / name for name in ("policies.md", "results.md", "tasks.md")),
     *sorted((ROOT / "results").glob("*/notes.md")),
 ]
 
@@ -43,6 +44,7 @@ class Arm:
     """What the rows of a study say of one variant in one setting, or in all settings of a mean.
 
     Args:
+        folder: of the study.
         rows: of the study.
         draws: of its demonstrations and starts.
         means: its settings by the name of their mean.
@@ -52,9 +54,10 @@ class Arm:
         SystemExit: the study has no such arm.
     """
 
-    def __init__(self, rows: pd.DataFrame, draws: Draws, means: dict[str, list[str]], name: str):
+    def __init__(self, folder: Path, rows: pd.DataFrame, draws: Draws, means: dict[str, list[str]], name: str):
         setting, variant = name.split("/")
         settings = means.get(setting, [setting])
+        self._times = [one for one in entries(folder) if one["arm"] in {f"{own}/{variant}" for own in settings}]
         own = rows[rows["setting"].isin(settings) & (rows["variant"] == variant)]
         if {*own["setting"]} != {*settings}:
             raise SystemExit(f"A page names {name}, which its study does not have.")
@@ -113,6 +116,16 @@ class Arm:
         errors = 1e4 * self.runs["heldout_mse_m2"].dropna()
         return f"{errors.mean():.2f} [{errors.min():.2f} to {errors.max():.2f}]" if len(errors) else "–"
 
+    def minutes(self) -> str:
+        """How long one set of demonstrations took, its features, and the training of one seed."""
+
+        def of(stage: str) -> str:
+            own = [one for one in self._times if one["stage"] == stage]
+            took = [one["seconds"] / (one["runs"] if stage == "training" else one.get("nodes", 1)) for one in own]
+            return f"{median(took) / 60:.0f}" if took else "–"
+
+        return ", ".join(map(of, STAGES[:3])) if self._times else "–"
+
     def cpu(self) -> str:
         told = {json.loads(versions).get("processor") or "not recorded" for versions in self.rows["versions"].dropna()}
         return " and ".join(sorted({re.sub(r"\(R\)| Processor| \(.*", "", name) for name in told}))
@@ -145,6 +158,7 @@ HEADS: dict[str, Callable[[Arm], str]] = {
     "each seed": Arm.each,
     "held-out error, 1e-4 m2": Arm.error,
     "CPU": Arm.cpu,
+    "minutes": Arm.minutes,
 }
 """Of columns."""
 
@@ -195,10 +209,10 @@ def _lines(page: Path, text: str | None = None) -> Iterator[tuple[str, list[str]
         yield LINK.sub(lambda one: _linked(one, arms), line), heads, cells
 
 
-def _study(folder: Path) -> tuple[pd.DataFrame, Draws, dict[str, list[str]]] | None:
-    """The rows of a study, its draws and its means; None if it has no rows yet."""
+def _study(folder: Path) -> tuple[Path, pd.DataFrame, Draws, dict[str, list[str]]] | None:
+    """A study's folder, its rows, its draws and its means; None if it has no rows yet."""
     if (folder / ROWS).is_file():
-        return read_rows(folder / ROWS), read_draws(folder), read_means(folder)
+        return folder, read_rows(folder / ROWS), read_draws(folder), read_means(folder)
     if not (ROOT / "configs" / "study" / f"{folder.name}.yaml").is_file():
         raise SystemExit(f"A page names {folder.name}, which is no study.")
     return None

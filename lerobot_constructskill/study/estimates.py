@@ -1,7 +1,7 @@
 """How long runs that are to be made will take, by what others took.
 
 It is rough: a variant that was not made in a setting is taken from another setting or study, whose demonstrations may
-be more or longer, and machines differ by a factor of three.
+be longer, and machines differ by a factor of three.
 """
 
 from collections import defaultdict
@@ -10,8 +10,11 @@ from pathlib import Path
 from statistics import median
 
 from lerobot_constructskill.artifacts.store import Node, Store
-from lerobot_constructskill.study.runs import Run
+from lerobot_constructskill.study.runs import Arm, Run
 from lerobot_constructskill.study.timing import entries
+
+OF_RUNS = ("training", "evaluation", "validation")
+"""Stages that are made for each run; others for each set that runs share."""
 
 
 class Estimates:
@@ -19,19 +22,23 @@ class Estimates:
 
     Args:
         folders: where each study has its rows and times.
-        episodes: how many each run of a study has.
+        runs: of each study, made or not.
         store: where runs are made.
     """
 
-    def __init__(self, folders: Mapping[str, Path], episodes: Mapping[str, int], store: Store):
+    def __init__(self, folders: Mapping[str, Path], runs: Mapping[str, Sequence[Run]], store: Store):
         self._store = store
         self._counted: set[Node | tuple[Node, int]] = set()
         self._took: dict[tuple[str, str, str], list[float]] = defaultdict(list)
         for study, folder in folders.items():
-            for entry in entries(folder):  # of a set and its features, of a seed, of an episode
-                number = {"training": entry["runs"], "evaluation": entry["runs"] * episodes[study]}
-                each = number.get(entry["stage"], entry.get("nodes", 1))
-                self._took[study, entry["arm"], entry["stage"]].append(entry["seconds"] / each)
+            arms = {run.arm.id: run.arm for run in runs[study]}
+            for entry in entries(folder):
+                if arm := arms.get(entry["arm"]):
+                    stage, number = (
+                        entry["stage"],
+                        entry["runs"] if entry["stage"] in OF_RUNS else entry.get("nodes", 1),
+                    )
+                    self._took[study, arm.id, stage].append(entry["seconds"] / number / _size(arm, stage))
         self._known, self._is_known = 0.0, True
 
     def tell(self, study: str, runs: Sequence[Run]) -> str:
@@ -57,11 +64,10 @@ class Estimates:
             once = (node, run.seed) if stage == "training" else node  # seeds that train together are one node
             if not (node.is_passing or self._store.has(node)) and once not in self._counted:
                 self._counted.add(once)
-                yield self._each(study, run, stage)
-        each = self._each(study, run, "evaluation")
-        yield None if each is None else len(run.arm.starts) * each
+                yield self._of(study, run, stage)
+        yield self._of(study, run, "evaluation")
 
-    def _each(self, study: str, run: Run, stage: str) -> float | None:
+    def _of(self, study: str, run: Run, stage: str) -> float | None:
         """By the same arm, else by the same variant of its study, else of any study; of demonstrations, else by
         another arm of the setting.
 
@@ -77,7 +83,13 @@ class Estimates:
             beside if stage == "demonstrations" else [],
         )
         keys = next(filter(None, choices), [])
-        return median(seconds for key in keys for seconds in self._took[key]) if keys else None
+        return _size(run.arm, stage) * median(one for key in keys for one in self._took[key]) if keys else None
+
+
+def _size(arm: Arm, stage: str) -> int:
+    """By what the time of a stage is counted: episodes of the evaluation, or demonstrations; a training as a whole."""
+    sizes = {"evaluation": len(arm.starts), "training": 1, "validation": 1}
+    return sizes.get(stage, arm.demonstrations.node.config.episodes if arm.demonstrations else 1)
 
 
 def _told(known: float, is_known: bool) -> str:

@@ -25,7 +25,7 @@ def status(table: Table, chosen: Sequence[Run], retry_failed: bool = False) -> s
         retry_failed: whether it makes failed runs again.
     """
     due = [run for run in chosen if (rows := table.made(run)) is None or (retry_failed and rows[0].error_kind)]
-    lines, times = [], Estimates({"": table.root}, {"": len(chosen[0].arm.starts)}, table.store)
+    lines, times = [], Estimates({"": table.root}, {"": table.runs}, table.store)
     for name, alike in groupby(chosen, key=lambda run: run.arm.id):
         runs = list(alike)
         lines += [f"{name}: {_counts(table, runs)}", *_failures(table, runs)]
