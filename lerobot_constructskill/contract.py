@@ -460,6 +460,8 @@ def get_task(name: str, action: str = TASK_ACTION) -> Task:
     tasks = _all_tasks()
     if name.startswith(PLANNED) and name != PLANNED:
         row = replace(PLAN_TASK, name=name, plan=name.removeprefix(PLANNED))
+    elif name in SUITES:
+        raise InputError(f"'{name}' is a suite, and one task is asked for: {', '.join(SUITES[name])}.")
     elif name not in tasks:
         raise InputError(f"Unknown task '{name}'; the tasks are: {', '.join(tasks)}; and {PLANNED}NAME_OR_FILE.")
     else:
@@ -491,7 +493,9 @@ def select_tasks(names: str, action: str = TASK_ACTION) -> dict[str, list[Task]]
         suite, members = (name, SUITES[name]) if name in SUITES else (LOOSE, (name,))
         if suite == LOOSE and name not in _all_tasks() and not name.startswith(PLANNED):
             tasks, suites = ", ".join(_all_tasks()), ", ".join(SUITES)
-            raise InputError(f"Unknown task '{name}'; the tasks are: {tasks}; the suites: {suites}.")
+            raise InputError(
+                f"Unknown task '{name}'; the tasks are: {tasks}; the suites: {suites}; and {PLANNED}NAME_OR_FILE."
+            )
         selected.setdefault(suite, []).extend(get_task(member, action) for member in members)
     rows = [row for suite in selected.values() for row in suite]
     if len(set(rows)) < len(rows):

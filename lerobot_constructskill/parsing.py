@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -144,6 +145,8 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
         try:
             made = draccus.decode(config_class, values)
         except draccus.utils.DecodingError as error:
+            if said := _of_fields(error, config_class):
+                raise InputError(said) from None
             name, found = ".".join(error.key_path), values
             for part in error.key_path:
                 found = found.get(part) if isinstance(found, Mapping) else None
@@ -152,6 +155,24 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
             raise InputError(refusal(name, kind, found)) from None
         check_same(made, values)
         return made
+
+
+def _of_fields(error: draccus.utils.DecodingError, config_class: type) -> str | None:
+    """What is wrong with the names of fields, if that is it: draccus says it in the code's words."""
+    where, names = ".".join(error.key_path), re.findall(r"`(\w+)`", error.message)
+    if error.message.startswith("Missing required field"):
+        missing = " and ".join(f"`{where}.{name}`" if where else f"`--{name}`" for name in names)
+        help_of = "" if where else "; `--help` says what it is" if len(names) == 1 else "; `--help` says what they are"
+        return f"{missing} {'is' if len(names) == 1 else 'are'} missing{help_of}."
+    if "are not valid for" in error.message:
+        owner = next((one for one in _alternatives(kind_of(config_class, where)) if is_dataclass(one)), None)
+        known = (
+            ""
+            if owner is None or not error.message.endswith(f" {owner.__name__}")
+            else (f"; it has {', '.join(one.name for one in fields(owner) if one.init)}")
+        )
+        return f"{where or 'The configuration'} has no field {' and no field '.join(map(repr, names))}{known}."
+    return None
 
 
 def check_same(made: Any, given: Any, name: str = "", kind: Any = Any) -> None:

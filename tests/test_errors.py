@@ -68,6 +68,18 @@ def test_a_fault_of_ours_is_called_one_and_its_traceback_is_kept(command: str, r
         assert "Traceback" in told and "in broken\n    raise error\nKeyError: 'a b'" in told
 
 
+def test_fields_that_are_missing_or_unknown_are_named_in_the_users_words(run: Run, tmp_path: Path) -> None:
+    said = "`--suite` and `--about` and `--root` are missing; `--help` says what they are."
+    assert said in run("constructskill-submit")[1]
+    study = tmp_path / "study.yaml"
+    for text, told in (
+        ("training: {epoch: 1}", "training has no field 'epoch'; it has epochs, batch_size"),
+        ("settings: {a: {}}", "`settings.a.data` is missing."),
+    ):
+        study.write_text(f"name: x\n{text}\n")
+        assert told in run("constructskill-study", str(study))[1]
+
+
 def test_without_debug_a_fault_is_one_sentence(run: Run, tmp_path: Path) -> None:
     for error in KeyError("a"), ValueError("operands could not be broadcast together"):
         status, printed = run("constructskill-report", error=error)

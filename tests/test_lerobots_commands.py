@@ -25,6 +25,7 @@ def test_the_reason_is_the_last_line(command: tuple[str, ...], flag: str, said: 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_program_of_ones_own_ends_with_its_traceback(tmp_path, monkeypatch) -> None:
     """One wants to know where."""
     monkeypatch.chdir(tmp_path)

@@ -30,6 +30,9 @@ STAND_INS = {
     "mine.yaml": "",
     "tinybc.yaml": "",
     "outputs/dart_1.yaml": "",
+    "plan:wall.yaml": "plan:bond_of_five",
+    "=wall.yaml": "=bond_of_five",
+    "$seed": "0",
     " ...": "",
     "=...": "=local/any",
 }
@@ -105,6 +108,8 @@ def test_fields_of_lerobots_are_known(command: str, example, monkeypatch, tmp_pa
     monkeypatch.setattr(sys, "argv", words(command, tmp_path))
     checkpoint = FrozenViTChunkConfig(device="cpu")  # in place of one that an earlier command makes
     monkeypatch.setattr(PreTrainedConfig, "from_pretrained", lambda *_, **__: checkpoint)
+    for name in ("_config_path_args", "_config_yaml_overrides"):  # what a file says, kept for the process
+        monkeypatch.setattr(parser, name, {})
 
     def read(config):
         return config

@@ -178,6 +178,8 @@ def submit(
         for name, setting in settings.items():
             place = environment_key(**setting.environment)
             there = [one for one in recorded.get(seed, []) if environment_key(**one.environment) == place]
+            if not there and seed not in failures:
+                _check_length(recorded.get(seed, []), name, setting, seed)
             starts = [one.evaluation_seed for one in there]
             for start in setting.starts:
                 found = [one for one in there if one.evaluation_seed == start]
@@ -204,6 +206,17 @@ def submit(
         backend=_only({claim.backend for claim in ended}, "backends"),
         versions=json.loads(_only({claim.versions for claim in ended}, "versions of packages or makes of processors")),
     )
+
+
+def _check_length(episodes: Iterable[Episode], name: str, setting: BoardSetting, seed: int) -> None:
+    """Refuse episodes of a setting that were recorded with another limit of steps, which is easily forgotten."""
+    task, asked, perturbed = environment_key(**setting.environment)
+    for there, length, label in (environment_key(**one.environment) for one in episodes):
+        if (there, label) == (task, perturbed) and length != asked:
+            raise InputError(
+                f"{name}, training seed {seed}, was recorded with at most {length} steps an episode, not {asked}: "
+                f"evaluate it with --env.episode_length={asked}."
+            )
 
 
 def _claim(found: Sequence[Episode], missing: Claim, setting: BoardSetting, there: Sequence[int]) -> Claim:

@@ -107,9 +107,10 @@ class GenerateConfig:
         for row in rows:
             elements = len(read_plan(row.plan).elements) if row.plan else 0
             if self.max_steps < elements * STEPS_AN_ELEMENT:
+                most = STEPS_AN_ELEMENT + 100
                 raise InputError(
-                    f"{row.name} has {elements} elements, of which each takes about {STEPS_AN_ELEMENT} steps: give "
-                    f"max_steps={elements * (STEPS_AN_ELEMENT + 100)}, not {self.max_steps}."
+                    f"{row.name} has {elements} elements, of which each takes about {STEPS_AN_ELEMENT} steps, with "
+                    f"noise up to {most}: give max_steps={elements * most}, not {self.max_steps}."
                 )
         asked = [row.instruction for row in rows if row.plan]
         if twice := next((one for one in asked if asked.count(one) > 1), None):

@@ -1,6 +1,7 @@
 """Whether a plan can be built by this robot: reach, room for the fingers, support, and the order of laying."""
 
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 from math import hypot
 
 from lerobot_constructskill.contract import ROBOT_BASE, highest_tcp
@@ -128,6 +129,10 @@ def _of_support(name: str, place: Position, kind: Kind, on: list[Box]) -> Iterat
     for other, middle, one in on:
         if max(_gaps(place[:2], kind, middle, one)) >= 0:
             yield f"The element '{name}' does not reach '{other}', which is to carry it: it would hang in the air."
+            return
+    for (other, middle, one), (another, its_middle, its_kind) in combinations(on, 2):
+        if _gaps(middle, one, its_middle, its_kind)[0] < -CLOSE:
+            yield f"The element '{name}' lies on '{other}' and '{another}', which must stand one after the other in x."
             return
     tops = [middle[2] + one.size[2] / 2 for _, middle, one in on]
     if max(tops) - min(tops) > LEANING:

@@ -186,6 +186,8 @@ def _floor(length: Any, supports: Sequence[tuple[Position, Position]]) -> Any:
     (a, a_size), (b, b_size) = supports
     inner = (abs(a[0] - b[0]) - (a_size[0] + b_size[0]) / 2) / 2
     outer = -_larger(-length / 2, -inner - (a_size[0] + b_size[0]) / 2)
+    if isinstance(inner, float) and inner + outer <= 0:  # side by side, which a check of the plan refuses
+        return _larger(*tops)
     return _larger(*tops) - abs(tops[0] - tops[1]) * inner / (inner + outer)
 
 

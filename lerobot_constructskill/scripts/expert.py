@@ -52,7 +52,7 @@ class FilmConfig(Checked):
             raise InputError(f"out must be a file that ends in .mp4, not '{self.out}'.")
 
 
-@command("constructskill-film --task=brick_on_brick")
+@command("constructskill-film brick_on_brick", first=("task",))
 def film(config: FilmConfig) -> str:
     """Write the video and return a line that says where, and how the episode ended.
 

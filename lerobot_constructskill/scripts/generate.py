@@ -5,7 +5,7 @@ from lerobot_constructskill.errors import plural, remedy_of
 from lerobot_constructskill.scripts.console import command, say
 
 
-@command("constructskill-generate fast --root=outputs/fast --workers=2", presets="generate")
+@command("constructskill-generate fast --repo_id=local/fast --root=outputs/fast --workers=2", presets="generate")
 def generate(config: GenerateConfig) -> str:
     from lerobot_constructskill.scripts.dataset import CardConfig, write_card
 

@@ -73,7 +73,7 @@ def _told(config_class: type, action: argparse.Action, required: bool, presets: 
     said = ((action.help or "").strip() or _arguments(config).get(name, "")).rstrip(".")
     field = next(one for one in fields(config) if one.name == name)
     if required and _is_required(field):
-        said += " (required without NAME)" if presets else " (required)"
+        said += " (required unless the file has it)" if presets else " (required)"
     elif "default" not in said and action.default not in (None, MISSING, argparse.SUPPRESS, "", [], (), {}):
         said += f" (default: {str(action.default).lower() if isinstance(action.default, bool) else action.default})"
     return said.strip().replace("%", "%%")

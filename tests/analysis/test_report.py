@@ -185,6 +185,7 @@ def findings(tmp_path_factory):
     return findings_of(STUDY, study_rows(), tmp_path_factory.mktemp("complete"))
 
 
+@pytest.mark.slow
 def test_tables_group_by_seeds_and_repeat_the_baseline(findings):
     backbones, ablations = findings.settings[0].groups
     assert (backbones.seeds, backbones.baseline, ablations.seeds) == (10, None, 3)
@@ -310,6 +311,7 @@ def test_walls_are_told_by_their_chains_and_where_these_break(tmp_path, no_figur
     assert "| two | 0.00 \\[0.00–0.00\\] | 0.00 | 4, 0, 0, 0 | – | – | – | – |" in text
 
 
+@pytest.mark.slow
 def test_declared_comparisons_are_the_family(tmp_path):
     findings = findings_of(STUDY, study_rows(), tmp_path, comparisons=[["clip", "dinov2"], ["augreg", "dinov2"]])
     fixed, moved = findings.settings
@@ -357,6 +359,7 @@ def test_a_sweep_is_one_table_and_one_figure_in_place_of_sections_that_compare_n
     assert ("#moved" in page.links) == ("moved" in sections)
 
 
+@pytest.mark.slow
 def test_a_mean_over_tasks_is_of_seeds_that_ran_in_all_and_pools_no_episodes(tmp_path, no_figures):
     rows = [row for row in study_rows() if (row.setting, row.variant, row.training_seed) != ("moved", "clip", 4)]
     (mean,) = findings_of(STUDY, rows, tmp_path, means={"both": ["fixed", "moved"]}).means
@@ -429,6 +432,7 @@ def files(root: Path) -> list[Path]:
     return [path for path in root.rglob("*") if path.is_file()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("met", [0, 2])
 def test_studies_at_the_ends(met, tmp_path):
     """All or none of the seeds succeed, no run has a held-out error, and nothing can be told apart."""

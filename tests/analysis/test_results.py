@@ -86,6 +86,7 @@ def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
         assert np.array_equal(imread(copy / figure), imread(folder / figure))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", render.PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
 def test_the_numbers_of_a_page_are_those_of_the_rows(page):
     assert render.render(page) == page.read_text(), "run: python results/render.py"

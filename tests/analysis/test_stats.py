@@ -266,6 +266,7 @@ def test_scipys_bootstrap_is_certain_of_ten_equal_seeds(method, rng):
     assert mean_rate(np.ones(10)).low == pytest.approx(0.025 ** (1 / 10))
 
 
+@pytest.mark.slow
 def test_a_ratio_of_spreads_is_found_in_four_of_five_studies():
     rng = np.random.default_rng(1)
     ratio = detectable_spread_ratio(10, 10)
@@ -291,6 +292,7 @@ def test_mean_test():
     assert mean_p_value(np.ones(1), np.zeros(1)) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("test", [mean_p_value, spread_p_value])
 def test_permutation_tests_keep_their_level(test, rng):
     p_values = [test(*rng.choice([0.0, 0.5, 1.0], (2, 4))) for _ in range(200)]

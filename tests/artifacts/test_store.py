@@ -111,6 +111,7 @@ def test_what_is_there_needs_nothing_of_what_it_was_made_of(store):
     assert store.get(Thing("third", (ONE,))) and store.has(ONE)
 
 
+@pytest.mark.slow
 def test_what_two_processes_want_is_made_by_one(store):
     context = multiprocessing.get_context("spawn")
     slow = Thing("slow", (replace(ONE, seconds=0.3),), seconds=0.3)
@@ -145,6 +146,7 @@ def several(request, monkeypatch):
     return lambda *names: [replace(Thing(name, (ONE,)), is_single_threaded=request.param) for name in names]
 
 
+@pytest.mark.slow
 def test_of_several_those_that_can_be_made_are(several, store):
     good, bad, unsendable, full = several("good", "bad", "unsendable", "full")
     lost = replace(Thing("lost", (Thing("bad input"),)), is_single_threaded=good.is_single_threaded)
@@ -168,6 +170,7 @@ def test_what_several_lack_is_tried_once(several, store, monkeypatch):
     assert len(failed) == 3 and tried == [lacking]
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_the_machines_failure_of_what_it_made_and_of_nothing_else(store, monkeypatch):
     monkeypatch.setattr(module, "cores", lambda: 2)
     dies, slow = (Thing(name, seconds=at, is_single_threaded=True) for name, at in (("dies", 0.5), ("slow", 1)))

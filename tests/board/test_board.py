@@ -77,6 +77,7 @@ def many(valid, tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_every_committed_entry_was_replayed_and_is_on_its_page(committed, tmp_path):
     texts = {path.stem: path.read_text() for path in write_board(BOARD, tmp_path, "alice/bench")}
     pages = {name: Page(text) for name, text in texts.items()}

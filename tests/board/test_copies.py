@@ -96,6 +96,7 @@ def test_the_expert_is_no_ten_training_seeds(tmp_path):
     assert "has the actions of the entry expert" in read_entries(tmp_path)[1][0]
 
 
+@pytest.mark.slow
 def test_what_is_on_the_board_is_far_from_a_copy():
     """Other seeds nearly six times as far as the tolerance, seeds that saw other light more than three times."""
     entries, refused = read_entries(ENTRIES.parent)

@@ -109,6 +109,9 @@ def test_a_missing_episode_is_refused_unless_its_run_failed(recorded, tmp_path):
     elsewhere = {name: replace(setting, first_start=40) for name, setting in SETTINGS.items()}
     with pytest.raises(InputError, match="starts 7 to 9 were, and 40 to 41 are asked for; for other starts give"):
         submit(tmp_path / "made", ABOUT, "bins", elsewhere, recorded_in(recorded), {})
+    longer = {name: replace(setting, episode_length=400) for name, setting in SETTINGS.items()}
+    with pytest.raises(InputError, match="seed 0, was recorded with at most 2 steps an episode, not 400: evaluate it"):
+        submit(tmp_path / "made", ABOUT, "bins", longer, recorded_in(recorded), {})
     submission = made(tmp_path / "made", recorded_in(recorded), {3: "out of memory", 5: "diverged"})
     failed = {claim.key: claim.error for claim in submission.claims if claim.error}
     diverged = dict.fromkeys([(name, 5, start) for name in SETTINGS for start in (7, 8)], "diverged")

@@ -128,6 +128,7 @@ def test_a_value_is_of_a_later_day_than_the_first_verdict():
             check_later(value, known)
 
 
+@pytest.mark.slow
 def test_many_settings_hide_nothing(submission):
     settings = {f"setting_{number}": BoardSetting("block_to_bin", STARTS) for number in range(MOST_SETTINGS)}
     said = replace(submission.declaration, settings=settings)

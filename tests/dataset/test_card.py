@@ -46,6 +46,7 @@ def test_every_column_of_every_task_has_its_meaning():
         assert set(features) - {camera.key for camera in CAMERAS.values()} == set(MEANINGS)
 
 
+@pytest.mark.slow
 def test_the_card_counts_what_there_is(card, data):
     rows = data.rows
     assert f"{rows['episode_index'].nunique()} scripted demonstrations ({len(rows)} frames" in card
@@ -58,6 +59,7 @@ def test_the_card_counts_what_there_is(card, data):
     np.testing.assert_allclose([float(found[1]), float(found[2])], [low, high], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_phase_that_no_demonstration_has_is_neither_counted_nor_shown(data, tmp_path):
     without = replace(data, rows=data.rows.assign(phase=data.rows["phase"].replace(Phase.PREGRASP, Phase.DESCEND)))
     card = render(card_facts(without))

@@ -21,6 +21,8 @@ from lerobot_constructskill.demos.columns import JOINT_COLUMNS, SIDECAR
 from lerobot_constructskill.demos.language import annotate
 from lerobot_constructskill.errors import InputError
 
+pytestmark = pytest.mark.slow
+
 VIDEO = "videos/observation.images.base/chunk-000/file-000.mp4"
 
 
@@ -384,7 +386,6 @@ def test_an_error_of_a_check_is_no_fault_of_the_data(error, pristine):
         complaints(open_dataset(pristine), broken)
 
 
-@pytest.mark.slow
 def test_the_command_prints_a_line_for_each_check_and_tells_by_its_status(pristine, copy):
     counted = f"9 demonstrations, 1108 frames: {len(CHECKS)} checks, nothing wrong."
     assert counted in call("constructskill-check", f"--root={pristine}")

@@ -21,6 +21,8 @@ from lerobot_constructskill.files import bounded_memory
 from lerobot_constructskill.scripts.dataset import CardConfig, CheckConfig, check_dataset, write_card
 from lerobot_constructskill.scripts.push_policy import render_card, seed_outcomes
 
+pytestmark = pytest.mark.slow
+
 JSON = ("meta/info.json", "meta/stats.json", SIDECAR)
 BINARY = ("meta/tasks.parquet", "data/*/*.parquet", "meta/episodes/*/*.parquet", "videos/*/*/*.mp4")
 

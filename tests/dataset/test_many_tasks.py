@@ -46,6 +46,7 @@ def copy(pristine, tmp_path):
     return Path(shutil.copytree(pristine, tmp_path / "set"))
 
 
+@pytest.mark.slow
 def test_a_set_of_several_tasks_passes_every_check(pristine):
     data = open_dataset(pristine)
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}

@@ -230,6 +230,7 @@ def test_the_load_compensation_holds_the_brick_where_the_arm_alone_sags():
     assert alone < -0.03 and 0 < compensated < -alone
 
 
+@pytest.mark.slow
 def test_the_hand_goes_round_the_base_to_every_place_where_elements_wait():
     """Where it goes by the actions alone, 40 % of what they ask for; within 0.22 m of the base it gets stuck."""
     expert, base = LayingExpert(ExpertConfig()), np.array(ROBOT_BASE)

@@ -389,8 +389,10 @@ def test_a_gpu_that_is_not_there_is_no_cpu_in_disguise():
 
 
 def test_a_suite_is_no_task_and_is_not_offered_as_one():
-    with pytest.raises(InputError, match="Unknown task 'bins'") as refusal:
+    with pytest.raises(InputError, match="'bins' is a suite, and one task is asked for: brick_to_bin, "):
         ConstructSkillEnv("bins")
+    with pytest.raises(InputError, match="Unknown task 'brick'") as refusal:
+        ConstructSkillEnv("brick")
     assert "suites" not in str(refusal.value)
     with pytest.raises(UserError, match="the suites: bins, ladder, joints"):
         ConstructSkillEnvConfig(task="brick")

@@ -342,6 +342,7 @@ def test_openvino_reports_nothing_over_the_network(tmp_path):
     assert run.stdout.strip() == "openvino.tools.ovc.telemetry_stub", run.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("wandb") is None, reason="there is no wandb to leave out")
 def test_timm_comes_without_wandb_which_can_be_imported_afterwards():
     """In a process of its own: both are imported once."""

@@ -144,6 +144,7 @@ def test_what_cannot_be_is_one_sentence(config, fields, sentence):
 # Several cameras
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("readout", ["cls", "mean", "spatial_softmax"])
 def test_two_cameras_are_read_one_after_the_other(config, images, readout):
     picture = PolicyFeature(FeatureType.VISUAL, (3, 224, 224))

@@ -69,6 +69,7 @@ def test_a_checkpoint_keeps_its_precision_where_another_would_be_faster(machine,
     assert FrozenViTChunkPolicy.from_pretrained(tmp_path).config.backbone_precision == "float32"
 
 
+@pytest.mark.slow
 def test_a_checkpoint_crosses_over_on_purpose_alone(machine, make_policy, images, tmp_path, caplog):
     machine("bfloat16")
     make_policy().save_pretrained(tmp_path / "made")
@@ -125,6 +126,7 @@ def test_features_of_a_cpu_are_told_apart_from_those_of_a_gpu(make_policy, monke
     assert "trained on features of openvino in float32, acts on features of torch in float32" in caplog.text
 
 
+@pytest.mark.slow
 def test_a_blind_encoder_sees_grey_whatever_it_is_shown(images):
     encoder = FrozenEncoder(BACKBONES["vit_tiny16"], "float32", blind=True)
     grey = [tokens[:1] for tokens in encoder.encode(torch.full_like(images, 0.5))]

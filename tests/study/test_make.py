@@ -354,6 +354,7 @@ def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_t
     assert not git(clone, "status", "--porcelain")
 
 
+@pytest.mark.slow
 def test_every_entry_that_is_made_of_a_study_is_on_the_board_and_names_settings_that_the_study_has(made):
     from entries import ENTRIES
 

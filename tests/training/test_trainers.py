@@ -105,6 +105,7 @@ class Full(Trainer):
         raise RuntimeError("SafetensorError: os error 28")
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_finds_no_room_is_the_machines_doing(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(disk.shutil, "disk_usage", disk.shutil.disk_usage)
     monkeypatch.setattr(trainers, "trainer_of", lambda config: Full())
