@@ -332,11 +332,16 @@ def test_a_set_in_lerobots_cache_or_on_the_hub_is_named_alone(tmp_path, monkeypa
     assert dataset["repo_id"] == "alice/bricks" and "root" not in dataset
 
 
-def test_training_is_written_for_a_set_alone():
+def test_training_is_written_for_a_set_alone(tmp_path):
     with pytest.raises(InputError, match="train/act is written for a data set: add --root=FOLDER"):
         write(ConfigConfig("train/act"))
     with pytest.raises(MissingError, match="no configuration 'train/atc'; the configurations are: .*train/act, "):
         write(ConfigConfig("train/atc", Path("anywhere")))
+    root = write_metadata(tmp_path / "features", [100] * 9)
+    (root / "meta" / "info.json").write_text('{"features": {"observation.features.wrist": {}}}')
+    assert write(ConfigConfig("train/frozen_vit_precise", root)).is_file()
+    with pytest.raises(InputError, match="holds features, which frozen_vit alone can read"):
+        write(ConfigConfig("train/act", root))
     with pytest.raises(InputError, match="Flags are for configurations of train/"):
         show_or_write(ConfigConfig("study/paper", Path("anywhere")))
 

@@ -48,16 +48,19 @@ def write(config: ConfigConfig) -> Path:
 
     Raises:
         MissingError: there is no such configuration or data set.
-        InputError: no data set is named, or LeRobot cannot hold out every eighth demonstration of it.
+        InputError: no data set is named, it holds features and the policy reads images, or LeRobot cannot hold out
+            every eighth demonstration of it.
         TakenError: the file is there and is not one that was written like this.
         OSError: the Hub does not have the data set, or the file cannot be written.
     """
     import yaml
 
     from lerobot_constructskill.artifacts.folders import write_text
+    from lerobot_constructskill.dataset.dataset import read_info
     from lerobot_constructskill.dataset.hub import locate
     from lerobot_constructskill.dataset.split import split_of
     from lerobot_constructskill.parsing import read_fields
+    from lerobot_constructskill.policies.frozen_vit.feature_sets import FEATURE_PREFIX
 
     template = read_fields(Path(show(config.name)))
     if config.root is None and config.repo_id is None:
@@ -68,7 +71,14 @@ def write(config: ConfigConfig) -> Path:
     folder = Path(os.path.abspath(config.root or Path("outputs") / config.repo_id.partition("/")[2]))
     source = {"repo_id": config.repo_id or f"local/{folder.name}"} | ({"root": str(folder)} if config.root else {})
     file = config.out or folder.with_name(f"{folder.name}_{config.name.removeprefix(TRAIN)}.yaml")
-    split, epochs = split_of(locate(config.repo_id, config.root)), config.epochs or template["epochs"]
+    located = locate(config.repo_id, config.root)
+    is_encoded = any(name.startswith(FEATURE_PREFIX) for name in read_info(located)["features"])
+    if is_encoded and template["policy"].get("type") != "frozen_vit":
+        raise InputError(
+            f"{config.root or config.repo_id} holds features, which frozen_vit alone can read: give the demonstrations "
+            "that they were encoded from."
+        )
+    split, epochs = split_of(located), config.epochs or template["epochs"]
     held_out = f"{split.n_held_out} of them" if split.n_held_out else "too few for every eighth to be"
     text = (
         f"# {config.name} for {config.root or config.repo_id}: {plural(len(split.episodes), 'demonstration')}, "
