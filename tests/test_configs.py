@@ -338,7 +338,9 @@ def test_training_is_written_for_a_set_alone(tmp_path):
     with pytest.raises(MissingError, match="no configuration 'train/atc'; the configurations are: .*train/act, "):
         write(ConfigConfig("train/atc", Path("anywhere")))
     root = write_metadata(tmp_path / "features", [100] * 9)
-    (root / "meta" / "info.json").write_text('{"features": {"observation.features.wrist": {}}}')
+    (root / "meta" / "info.json").write_text(
+        '{"features": {"observation.features.wrist": {"dtype": "float32", "shape": [2], "names": null}}}'
+    )
     assert write(ConfigConfig("train/frozen_vit_precise", root)).is_file()
     with pytest.raises(InputError, match="holds features, which frozen_vit alone can read"):
         write(ConfigConfig("train/act", root))

@@ -75,8 +75,8 @@ def write(config: ConfigConfig) -> Path:
     is_encoded = any(name.startswith(FEATURE_PREFIX) for name in read_info(located)["features"])
     if is_encoded and template["policy"].get("type") != "frozen_vit":
         raise InputError(
-            f"{config.root or config.repo_id} holds features, which frozen_vit alone can read: give the demonstrations "
-            "that they were encoded from."
+            f"{config.root or config.repo_id} holds features, which frozen_vit alone can read: give the "
+            "demonstrations that they were encoded from."
         )
     split, epochs = split_of(located), config.epochs or template["epochs"]
     held_out = f"{split.n_held_out} of them" if split.n_held_out else "too few for every eighth to be"
