@@ -11,6 +11,7 @@ entries that are made of studies (`entries.py`) are written and committed with t
     python results/make.py --discard           # remove demonstrations and features that no piece needs any more
 """
 
+import json
 import subprocess
 import time
 from argparse import RawDescriptionHelpFormatter
@@ -24,9 +25,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from entries import drop, keep, whole, write_entries
-from render import PAGES, render
+from render import PAGES, make_of, render
 
 from lerobot_constructskill.artifacts.folders import write_text
+from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Node, Store
 from lerobot_constructskill.errors import InputError, plural
 from lerobot_constructskill.lerobot_internals import load_plugins
@@ -37,7 +39,7 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Draws, Row, load_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Draws, Row, load_rows, read_rows
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
@@ -90,6 +92,10 @@ class Piece:
     @property
     def only(self) -> str:
         return ",".join(run.id for run in self.runs)
+
+    @property
+    def setting(self) -> str:
+        return self.runs[0].arm.setting
 
     @property
     def names(self) -> set[Name]:
@@ -165,9 +171,25 @@ class Maker:
         """A line for each piece that is to be made, and their number."""
         times = self.times()
         due = [(piece, runs) for piece, runs in self.due(pieces) if runs]
-        lines = [f"{piece.name}: {plural(len(runs), 'run')}, {times.tell(piece.study, runs)}" for piece, runs in due]
+        lines = [self.told(piece, runs, times) for piece, runs in due]
         left = f"; the others: {times.total()}" if due else ""
         return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made{left}"])
+
+    def told(self, piece: Piece, runs: Sequence[Run], times: Estimates) -> str:
+        """What is to be made of a piece, how long it takes, and whether its setting has rows of other processors."""
+        made = {
+            run.digest
+            for one in self.every
+            if one.study == piece.study
+            for run in one.runs
+            if run.arm.setting == piece.setting
+        }
+        file = self.folder(piece.study) / ROWS
+        rows = read_rows(file) if file.is_file() else None
+        versions = [] if rows is None else rows[rows["run"].isin(made)]["versions"].dropna().unique()
+        others = {make_of(json.loads(one)["processor"]) for one in versions} - {make_of(processor())}
+        told = f"{piece.name}: {plural(len(runs), 'run')}, {times.tell(piece.study, runs)}"
+        return f"{told}; rows of {piece.setting} are of {' and '.join(sorted(others))}" if others else told
 
     def times(self) -> Estimates:
         """How long runs take, by what is in the folders of all studies now."""
@@ -355,8 +377,7 @@ def main() -> None:
         if asked.minutes is not None and time.monotonic() - start > 60 * asked.minutes:
             say(f"Stopped before {piece.name}; the same command continues there")
             return
-        told = f"{plural(len(runs), 'run')}, {maker.times().tell(piece.study, runs)}" if runs else "to be committed"
-        say(f"{piece.name}: {told}")
+        say(maker.told(piece, runs, maker.times()) if runs else f"{piece.name}: to be committed")
         maker.make(piece)
         if asked.discard:
             maker.discard()

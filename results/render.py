@@ -128,7 +128,12 @@ class Arm:
 
     def cpu(self) -> str:
         told = {json.loads(versions).get("processor") or "not recorded" for versions in self.rows["versions"].dropna()}
-        return " and ".join(sorted({re.sub(r"\(R\)| Processor| \(.*", "", name) for name in told}))
+        return " and ".join(sorted(set(map(make_of, told))))
+
+
+def make_of(processor: str) -> str:
+    """The make of a processor: its name without family and model."""
+    return re.sub(r"\(R\)| Processor| \(.*", "", processor)
 
 
 WORDS: dict[str, Callable[[Arm], str]] = {
