@@ -66,7 +66,9 @@ class Parser(ArgumentParser):
         path = texts.pop("config_path")
         said = {name: _value(text, kind_of(self.config_class, name)) for name, text in texts.items()}
         read = {} if path is None else read_fields(Path(path))
-        return decode(self.config_class, mergedeep.merge(read, draccus.utils.deflatten(said, sep=".")))
+        return decode(
+            self.config_class, mergedeep.merge(read, draccus.utils.deflatten(said, sep=".")), is_command=True
+        )
 
 
 def kind_of(config_class: type, name: str) -> Any:
@@ -135,8 +137,11 @@ def read_fields(path: Path) -> dict[str, Any]:
     return (JSON if path.suffix == ".json" else YAML).read(path)
 
 
-def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Config:
+def decode[Config](config_class: type[Config], values: Mapping[str, Any], is_command: bool = False) -> Config:
     """Make a configuration of plain values.
+
+    Args:
+        is_command: whether its fields are flags of a command, with a `--help`.
 
     Raises:
         InputError: they do not make one, or draccus would turn one of them into something else.
@@ -145,7 +150,7 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
         try:
             made = draccus.decode(config_class, values)
         except draccus.utils.DecodingError as error:
-            if said := _of_fields(error, config_class):
+            if said := _of_fields(error, config_class, is_command):
                 raise InputError(said) from None
             name, found = ".".join(error.key_path), values
             for part in error.key_path:
@@ -157,20 +162,20 @@ def decode[Config](config_class: type[Config], values: Mapping[str, Any]) -> Con
         return made
 
 
-def _of_fields(error: draccus.utils.DecodingError, config_class: type) -> str | None:
+def _of_fields(error: draccus.utils.DecodingError, config_class: type, is_command: bool) -> str | None:
     """What is wrong with the names of fields, if that is it: draccus says it in the code's words."""
-    where, names = ".".join(error.key_path), re.findall(r"`(\w+)`", error.message)
+    where, names = ".".join(error.key_path), re.findall(r"`([^`]*)`", error.message)
     if error.message.startswith("Missing required field"):
-        missing = " and ".join(f"`{where}.{name}`" if where else f"`--{name}`" for name in names)
-        help_of = "" if where else "; `--help` says what it is" if len(names) == 1 else "; `--help` says what they are"
-        return f"{missing} {'is' if len(names) == 1 else 'are'} missing{help_of}."
+        are_flags = is_command and not where
+        before = "--" if are_flags else f"{where}." if where else ""
+        it, are = ("it", "is") if len(names) == 1 else ("they", "are")
+        hint = f"; `--help` says what {it} {are}" if are_flags else ""
+        return f"{' and '.join(f'`{before}{name}`' for name in names)} {are} missing{hint}."
     if "are not valid for" in error.message:
-        owner = next((one for one in _alternatives(kind_of(config_class, where)) if is_dataclass(one)), None)
-        known = (
-            ""
-            if owner is None or not error.message.endswith(f" {owner.__name__}")
-            else (f"; it has {', '.join(one.name for one in fields(owner) if one.init)}")
-        )
+        kind = kind_of(config_class, where) if where else config_class
+        owner = next((one for one in _alternatives(kind) if is_dataclass(one)), None)
+        is_known = owner is not None and error.message.endswith(f" {owner.__name__}")
+        known = f"; it has {', '.join(one.name for one in fields(owner) if one.init)}" if is_known else ""
         return f"{where or 'The configuration'} has no field {' and no field '.join(map(repr, names))}{known}."
     return None
 

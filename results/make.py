@@ -177,13 +177,10 @@ class Maker:
 
     def told(self, piece: Piece, runs: Sequence[Run], times: Estimates) -> str:
         """What is to be made of a piece, how long it takes, and whether its setting has rows of other processors."""
-        made = {
-            run.digest
-            for one in self.every
-            if one.study == piece.study
-            for run in one.runs
-            if run.arm.setting == piece.setting
-        }
+        own = (
+            run for one in self.every if one.study == piece.study and one.setting == piece.setting for run in one.runs
+        )
+        made = {digest for run in own for digest in run.digests}
         file = self.folder(piece.study) / ROWS
         rows = read_rows(file) if file.is_file() else None
         versions = [] if rows is None else rows[rows["run"].isin(made)]["versions"].dropna().unique()
@@ -286,20 +283,20 @@ class Maker:
             raise InputError(
                 "No branch is checked out, so that commits would be lost: `git switch -c NAME` makes one."
             )
-        if (self.root / self._git("rev-parse", "--git-path", "MERGE_HEAD").strip()).exists():
-            raise InputError("A merge is going on: finish it first (`git status`).")
+        for name in ("MERGE_HEAD", "CHERRY_PICK_HEAD", "index.lock"):
+            if (file := self.root / self._git("rev-parse", "--git-path", name).strip()).exists():
+                raise InputError(f"Something else is going on in git: finish it first (`git status`; {file}).")
         if edited := self._git("status", "--porcelain", "--", *SOURCES).splitlines():
             raise InputError(f"Commit your edits first, so that a commit makes the rows again: {edited[0][3:]}")
         for page in self._pages:
             now, before = page.read_text(encoding="utf-8"), self._committed(page).decode()
-            if now not in (before, render(page, before)):  # the latter is what a killed process leaves
+            if now != before and now != render(page, before):  # what a killed process leaves
                 raise InputError(f"Commit your edits first: {page.relative_to(self.root)} is committed with the rows.")
         for study in self.configs:
             waiting = self._uncommitted(study) - piece.names
             if other := next((one for one in self.every if one.study == study and one.names & waiting), None):
                 raise InputError(
-                    f"{other.name} has rows that are in no commit. Make it first (`--only={other.name}`), or throw "
-                    f"them away (`git restore results/{study}`)."
+                    f"{other.name} has rows that are in no commit: make it first (`--only={other.name}`)."
                 )
 
     def _commit(self, message: str, *paths: Path) -> None:

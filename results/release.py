@@ -85,7 +85,7 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine, draf
         user: whose repositories they are.
         store: where `make results` works.
         site: where `make docs` built the site.
-        draft: whether results may be missing or of older code.
+        draft: whether results may be missing or of older code, and checkpoints other than those of the rows.
 
     Raises:
         MissingError: the site was not built.
@@ -98,7 +98,7 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine, draf
         raise TakenError(f"{out} exists already, and is no release: move it away.")
     if (left := _left(store)) and not draft:
         raise InputError(
-            f"{plural(left, 'piece')} of the results are missing, or made by older code: `make results` makes them. "
+            f"The results lack {plural(left, 'piece')}, or have them of older code: `make results` makes them. "
             "--draft writes a release without them, which cannot be uploaded."
         )
     release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}", draft=left > 0)
@@ -107,8 +107,8 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine, draf
     }
     runs = {data: _runs(study, arm) for data, (study, arm) in POLICIES.items()}
     sets |= {data: own[0].arm.demonstrations.node for data, own in runs.items()}
-    # First what another kind of processor would make otherwise.
-    policies = {data: _Policies(study, runs[data], store, machine) for data, (study, _) in POLICIES.items()}
+    # First the checkpoints, which another kind of processor trains otherwise.
+    policies = {data: _Policies(study, runs[data], store, machine, draft) for data, (study, _) in POLICIES.items()}
     made = {name: store.get(node, machine) for name, node in sets.items()}
     if out.exists():
         shutil.rmtree(out)
@@ -138,17 +138,17 @@ class _Policies:
     """The checkpoints of an arm's runs.
 
     Raises:
-        InputError: one is not that of the published rows.
+        InputError: one is not that of the published rows, and this is no draft.
     """
 
-    def __init__(self, study: str, runs: Sequence[Run], store: Store, machine: Machine):
+    def __init__(self, study: str, runs: Sequence[Run], store: Store, machine: Machine, draft: bool):
         self._study, self._arm = study, runs[0].arm
         rows = read_rows(ROOT / "results" / study / ROWS)
         self._rows = rows[(rows["setting"] == self._arm.setting) & (rows["variant"] == self._arm.name)]
         weights = self._rows.drop_duplicates("training_seed").set_index("training_seed")["weights_sha256"]
         self._checkpoints = {run: checkpoint_of(run.seed, store.get(run.checkpoints, machine)) for run in runs}
         for run, checkpoint in self._checkpoints.items():
-            if file_sha256(checkpoint / "model.safetensors") != weights[run.seed]:
+            if not draft and file_sha256(checkpoint / "model.safetensors") != weights[run.seed]:
                 raise InputError(
                     f"The weights of {study}/{run.id} here are not those of the published rows: release on the kind "
                     f"of processor that made {study}/{self._arm.setting}, after `make results`."
@@ -203,11 +203,11 @@ def push(out: Path) -> None:
                 if release["tag"] in {tag.name for tag in api.list_repo_refs(**repo).tags}:
                     say(f"'{repo['repo_id']}' holds {release['tag']} already")
                     continue
-                if kind != "dataset":
+                if kind == "dataset":
+                    push_dataset(PushConfig(repo["repo_id"], root, update=True))
+                else:
                     api.upload_folder(**repo, folder_path=root, allow_patterns=files, delete_patterns="*")
-                    api.create_tag(**repo, tag=release["tag"])
-            if kind == "dataset":
-                push_dataset(PushConfig(repo["repo_id"], root, tag=release["tag"], update=True))
+                api.create_tag(**repo, tag=release["tag"])  # last, so what has it is whole
             say(f"Pushed: {repo['repo_id']}")
 
 

@@ -62,7 +62,8 @@ class Arm:
         if {*own["setting"]} != {*settings}:
             raise SystemExit(f"A page names {name}, which its study does not have.")
         runs = runs_of(own)
-        runs["episodes"] = runs["episodes"].max()  # a failed one did none of them
+        planned = own.groupby(["setting", "training_seed"])["episodes"].first()  # a failed run did none of them
+        runs["episodes"] = [planned[key] for key in zip(runs["setting"], runs["training_seed"], strict=True)]
         runs = _over(runs, len(settings))
         units = runs["training_seed"].map(draws.unit)
         whole = units.map(units.value_counts()) == (draws.seeds_a_draw if draws.groups_seeds else 1)

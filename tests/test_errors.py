@@ -74,6 +74,8 @@ def test_fields_that_are_missing_or_unknown_are_named_in_the_users_words(run: Ru
     study = tmp_path / "study.yaml"
     for text, told in (
         ("training: {epoch: 1}", "training has no field 'epoch'; it has epochs, batch_size"),
+        ("training: {learning-rate: 1}", "training has no field 'learning-rate'; it has epochs"),
+        ("nam: y", "The configuration has no field 'nam'; it has "),
         ("settings: {a: {}}", "`settings.a.data` is missing."),
     ):
         study.write_text(f"name: x\n{text}\n")

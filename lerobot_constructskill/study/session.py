@@ -46,7 +46,8 @@ def run_study(study: Study, text: str, root: Path, store: Store, options: Option
     runs = list_runs(study)
     chosen = choose(runs, options.only)
     with locked(root / ".lock", taken=f"Another process is running the study in {root} at this moment."):
-        table = Table(root, runs, store, options.replace)
+        # What is published is committed piece by piece: what the store has of others is theirs.
+        table = Table(root, runs, store, options.replace, chosen if options.replace else None)
         _check_nothing_is_lost(table)
         write_text(root / STUDY, text)
         facts = root / PROVENANCE

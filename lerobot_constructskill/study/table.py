@@ -31,10 +31,19 @@ class Table:
         store: where they are made.
         replaces: whether rows that were made of something else stand until a run of their setting and variant is made,
             and then go.
+        stored: the runs whose rows may come from the store, others have those of the folder; None for all.
     """
 
-    def __init__(self, root: Path, runs: Sequence[Run], store: Store, replaces: bool = False):
+    def __init__(
+        self,
+        root: Path,
+        runs: Sequence[Run],
+        store: Store,
+        replaces: bool = False,
+        stored: Sequence[Run] | None = None,
+    ):
         self.root, self.runs, self.store, self.replaces = root, runs, store, replaces
+        self._of_store = {run.id for run in (runs if stored is None else stored)}
         file = root / ROWS
         before = [row for row in load_rows(file) if row.error_kind != NOT_RUN] if file.exists() else []
         by_run = groupby(before, key=lambda row: (row.setting, row.variant, row.run))
@@ -63,7 +72,7 @@ class Table:
             InputError: the run's folder in the store holds something else.
         """
         if run.id not in self._made and (rows := self._rows_before(run) or self._stored(run)):
-            is_ours = rows[0].run == run.digest  # and of no other kind of machine
+            is_ours = rows[0].run == run.digest and run.id in self._of_store  # and of no other kind of machine
             columns = _names(run) | (self._heldout_errors(run) if is_ours else {})
             self._made[run.id] = [replace(row, **columns) for row in rows]
         return self._made.get(run.id)
@@ -75,7 +84,7 @@ class Table:
 
     def _stored(self, run: Run) -> list[Row]:
         """The rows of a run in the store; none where it does not have the run."""
-        if not self.store.has(run):
+        if run.id not in self._of_store or not self.store.has(run):
             return []
         file = self.store.folder(run) / EPISODES
         if not file.is_file():

@@ -240,7 +240,7 @@ def test_what_would_spoil_a_commit_is_refused_before_the_hours_that_a_piece_take
         maker.make(one)
     git(checkout, "switch", "--quiet", "-")
     (checkout / ".git" / "MERGE_HEAD").write_text(git(checkout, "rev-parse", "HEAD"))
-    with pytest.raises(InputError, match="A merge is going on"):
+    with pytest.raises(InputError, match=r"Something else is going on in git: .*MERGE_HEAD"):
         maker.make(one)
     (checkout / ".git" / "MERGE_HEAD").unlink()
     with (
@@ -260,11 +260,24 @@ def test_rows_of_another_piece_are_not_committed_half_made(checkout, tmp_path, m
     with monkeypatch.context() as killed, pytest.raises(SystemExit):
         killed.setattr(maker, "_commit", lambda *_: sys.exit("killed"))
         maker.make(two)
-    with pytest.raises(InputError, match=r"tiny/two has rows that are in no commit.*git restore results/tiny"):
+    with pytest.raises(
+        InputError, match=r"tiny/two has rows that are in no commit: make it first \(`--only=tiny/two`"
+    ):
         maker.make(one)
     maker.make(two)
     maker.make(one)
     assert git(checkout, "log", "-2", "--format=%s").splitlines() == ["Results: tiny/one", "Results: tiny/two"]
+
+
+def test_a_piece_takes_nothing_of_others_from_the_store(checkout, tmp_path, made):
+    """Another study may have made their runs; with their own piece come their recordings."""
+    clone = tmp_path / "clone"
+    git(tmp_path, "clone", "--quiet", str(checkout), str(clone))
+    elsewhere, maker = (made.Maker(root, tmp_path / "store", ["tiny"]) for root in (clone, checkout))
+    one, _, two = maker.pieces()
+    elsewhere.make(elsewhere.pieces("tiny/two")[0])
+    maker.make(one)
+    assert [len(runs) for _, runs in maker.due([one, two])] == [0, 3]
 
 
 def test_a_folder_that_somebody_removed_is_made_anew(checkout, tmp_path, made):
