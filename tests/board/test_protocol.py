@@ -62,7 +62,9 @@ def test_the_page_names_the_other_numbers():
 
 
 def test_the_pages_files_are_what_submit_reads():
-    about, settings = re.search("```yaml\n# about.yaml\n(.*?)# settings.yaml\n(.*?)```", PAGE, re.DOTALL).groups()
+    about, settings = (
+        re.search(f"```yaml\n# {name}.yaml\n(.*?)```", PAGE, re.DOTALL)[1] for name in ("about", "settings")
+    )
     assert About(**yaml.safe_load(about)).observes in OBSERVES
     assert [BoardSetting(**one).task for one in yaml.safe_load(settings).values()] == ["brick_to_bin_turned"]
 

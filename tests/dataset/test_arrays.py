@@ -4,7 +4,10 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 from lerobot.datasets import LeRobotDataset
+
+pytestmark = pytest.mark.slow
 
 PAGE = Path(__file__).parents[2] / "docs" / "data_sets.md"
 

@@ -29,6 +29,8 @@ from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.references import ReplayAgent
 from lerobot_constructskill.training.recipe import held_out_of
 
+pytestmark = pytest.mark.slow
+
 NAMES = [task for task in SUITES["bins"] for _ in range(3)]
 """The task of each episode."""
 
@@ -46,7 +48,6 @@ def copy(pristine, tmp_path):
     return Path(shutil.copytree(pristine, tmp_path / "set"))
 
 
-@pytest.mark.slow
 def test_a_set_of_several_tasks_passes_every_check(pristine):
     data = open_dataset(pristine)
     assert {name: complaints(data, check) for name, check in CHECKS.items()} == {name: [] for name in CHECKS}
@@ -139,7 +140,6 @@ def test_a_feature_set_says_of_which_task_its_episodes_are(pristine, tmp_path):
     assert held_out_of(LeRobotDataset("local/features", root=tmp_path / "set"), 2) == [1, 4, 7]
 
 
-@pytest.mark.slow
 def test_stock_act_trains_on_it_and_its_errors_are_measured_in_seven_numbers(pristine, tmp_path):
     small = ["dim_model=32", "n_heads=2", "dim_feedforward=32", "n_encoder_layers=1", "latent_dim=8", "chunk_size=10"]
     flags = [*small, "n_action_steps=10", "pretrained_backbone_weights=null", "push_to_hub=false", "device=cpu"]

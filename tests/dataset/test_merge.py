@@ -9,6 +9,8 @@ from lerobot_constructskill.demos import merge
 from lerobot_constructskill.demos.metadata import file_hashes
 from lerobot_constructskill.lerobot_internals import load_episodes
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def lerobots_way(monkeypatch):
@@ -35,13 +37,11 @@ def test_statistics_are_of_one_column_after_another(pristine, monkeypatch):
     assert asked == [[name] for name in statistics]
 
 
-@pytest.mark.slow
 def test_a_set_is_the_same_file_for_file_as_lerobot_merges_it(pristine, tmp_path, lerobots_way):
     record_toy(tmp_path / "plain", episodes=9)
     assert file_hashes(tmp_path / "plain") == file_hashes(pristine)
 
 
-@pytest.mark.slow
 def test_groups_of_groups_hold_the_same_frames_in_the_same_order(pristine, tmp_path, monkeypatch):
     monkeypatch.setattr(merge, "GROUP", 2)  # nine demonstrations: five groups, three, two, one
     record_toy(tmp_path / "grouped", episodes=9)

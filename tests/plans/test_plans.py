@@ -207,6 +207,7 @@ def test_any_plan_is_a_task_of_every_command():
         get_task("plan:")
 
 
+@pytest.mark.slow
 def test_the_command_checks_draws_and_tells(tmp_path):
     picture = tmp_path / "bond.png"
     assert "5 elements, can be built" in call("constructskill-plan", "bond_of_five", f"--picture={picture}")

@@ -822,7 +822,10 @@ def test_a_reference_of_a_policy_is_made_of_the_first_variant_that_can_be_it(tmp
         ({"settings": {"fixed": Setting("smoke", {"foo": 1})}}, "settings.fixed.env: .*foo"),
         ({"settings": {"fixed": Setting("smoke", {"episode_length": -5})}}, "settings.fixed.env: episode_length"),
         ({"settings": {"fixed": Setting("smoke", {"task": "bins"})}}, "settings.fixed.env: .*bins"),
-        ({"settings": {"fixed": Setting("smoke", ENV | {"task": "bins"})}}, "settings.fixed.env: 'bins' is a suite, and one task is asked for"),
+        (
+            {"settings": {"fixed": Setting("smoke", ENV | {"task": "bins"})}},
+            "settings.fixed.env: 'bins' is a suite, and one task is asked for",
+        ),
         ({"settings": {"fixed": Setting("smoke", ENV | {"task": "block_to_bin", "perturb": "size=1"})}}, "no brick"),
         (
             {
