@@ -173,9 +173,9 @@ def _of_fields(error: draccus.utils.DecodingError, config_class: type, is_comman
         return f"{' and '.join(f'`{before}{name}`' for name in names)} {are} missing{hint}."
     if "are not valid for" in error.message:
         kind = kind_of(config_class, where) if where else config_class
-        owner = next((one for one in _alternatives(kind) if is_dataclass(one)), None)
-        is_known = owner is not None and error.message.endswith(f" {owner.__name__}")
-        known = f"; it has {', '.join(one.name for one in fields(owner) if one.init)}" if is_known else ""
+        owners = [one for one in _alternatives(kind) if isinstance(one, type) and is_dataclass(one)]
+        there = [one.name for owner in owners if error.message.endswith(f" {owner.__name__}") for one in fields(owner)]
+        known = f"; it has {', '.join(there)}" if there else ""
         return f"{where or 'The configuration'} has no field {' and no field '.join(map(repr, names))}{known}."
     return None
 
