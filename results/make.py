@@ -141,6 +141,11 @@ class Maker:
         """All pieces."""
         return [piece for name, config in self.configs.items() for piece in pieces_of(name, config.study)]
 
+    @cached_property
+    def _runs(self) -> dict[str, list[Run]]:
+        """All runs of each study."""
+        return {study: [run for one in self.every if one.study == study for run in one.runs] for study in self.configs}
+
     def pieces(self, only: str = "") -> list[Piece]:
         """All pieces, or those whose names fit a pattern or begin with it.
 
@@ -172,15 +177,19 @@ class Maker:
         times = self.times()
         due = [(piece, runs) for piece, runs in self.due(pieces) if runs]
         lines = [self.told(piece, runs, times) for piece, runs in due]
-        left = f"; the others: {times.total()}" if due else ""
-        return "\n".join([*lines, f"{len(pieces) - len(due)} of {plural(len(pieces), 'piece')} made{left}"])
+        return "\n".join([*lines, _total(pieces, len(due), times)])
+
+    def total(self, pieces: Sequence[Piece]) -> str:
+        """The last line of that."""
+        times = self.times()
+        due = [times.tell(piece.study, runs) for piece, runs in self.due(pieces) if runs]
+        return _total(pieces, len(due), times)
 
     def told(self, piece: Piece, runs: Sequence[Run], times: Estimates) -> str:
         """What is to be made of a piece, how long it takes, and whether its setting has rows of other processors."""
-        own = (
-            run for one in self.every if one.study == piece.study and one.setting == piece.setting for run in one.runs
-        )
-        made = {digest for run in own for digest in run.digests}
+        made = {
+            digest for run in self._runs[piece.study] if run.arm.setting == piece.setting for digest in run.digests
+        }
         file = self.folder(piece.study) / ROWS
         rows = read_rows(file) if file.is_file() else None
         versions = [] if rows is None else rows[rows["run"].isin(made)]["versions"].dropna().unique()
@@ -191,11 +200,7 @@ class Maker:
     def times(self) -> Estimates:
         """How long runs take, by what is in the folders of all studies now."""
         folders = {study: self.folder(study) for study in self.configs}
-        runs = {
-            study: [run for piece in self.every if piece.study == study for run in piece.runs]
-            for study in self.configs
-        }
-        return Estimates(folders, runs, self.store)
+        return Estimates(folders, self._runs, self.store)
 
     def is_committed(self, piece: Piece) -> bool:
         """Whether its rows are in a commit, and no entry of its study waits to be written.
@@ -321,6 +326,11 @@ class Maker:
         return done.stdout
 
 
+def _total(pieces: Sequence[Piece], due: int, times: Estimates) -> str:
+    left = f"; the others: {times.total()}" if due else ""
+    return f"{len(pieces) - due} of {plural(len(pieces), 'piece')} made{left}"
+
+
 def _by_run(rows: Iterable[Row]) -> dict[Name, list[Row]]:
     found: dict[Name, list[Row]] = defaultdict(list)
     for row in rows:
@@ -365,7 +375,7 @@ def main() -> None:
     if asked.status:
         say(maker.status(pieces))
         return
-    say(maker.status(pieces).splitlines()[-1])
+    say(maker.total(pieces))
     if asked.discard:
         maker.discard()
     for piece, runs in maker.due(pieces):

@@ -26,7 +26,7 @@ from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, by_unit, chance_of, count, runs_of
 from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_means, read_rows
-from lerobot_constructskill.study.timing import STAGES, entries
+from lerobot_constructskill.study.timing import STAGES, entries, seconds_of_one
 
 ROOT = Path(__file__).parents[1]
 
@@ -121,8 +121,7 @@ class Arm:
         """How long one set of demonstrations took, its features, and the training of one seed."""
 
         def of(stage: str) -> str:
-            own = [one for one in self._times if one["stage"] == stage]
-            took = [one["seconds"] / (one["runs"] if stage == "training" else one.get("nodes", 1)) for one in own]
+            took = [seconds_of_one(one) for one in self._times if one["stage"] == stage]
             return f"{median(took) / 60:.0f}" if took else "–"
 
         return ", ".join(map(of, STAGES[:3])) if self._times else "–"

@@ -11,10 +11,7 @@ from statistics import median
 
 from lerobot_constructskill.artifacts.store import Node, Store
 from lerobot_constructskill.study.runs import Arm, Run
-from lerobot_constructskill.study.timing import entries
-
-OF_RUNS = ("training", "evaluation", "validation")
-"""Stages that are made for each run; others for each set that runs share."""
+from lerobot_constructskill.study.timing import OF_RUNS, entries, seconds_of_one
 
 
 class Estimates:
@@ -34,11 +31,8 @@ class Estimates:
             arms = {run.arm.id: run.arm for run in runs[study]}
             for entry in entries(folder):
                 if arm := arms.get(entry["arm"]):
-                    stage, number = (
-                        entry["stage"],
-                        entry["runs"] if entry["stage"] in OF_RUNS else entry.get("nodes", 1),
-                    )
-                    self._took[study, arm.id, stage].append(entry["seconds"] / number / _size(arm, stage))
+                    stage = entry["stage"]
+                    self._took[study, arm.id, stage].append(seconds_of_one(entry) / _size(arm, stage))
         self._known, self._is_known = 0.0, True
 
     def tell(self, study: str, runs: Sequence[Run]) -> str:
@@ -88,8 +82,9 @@ class Estimates:
 
 def _size(arm: Arm, stage: str) -> int:
     """By what the time of a stage is counted: episodes of the evaluation, or demonstrations; a training as a whole."""
-    sizes = {"evaluation": len(arm.starts), "training": 1, "validation": 1}
-    return sizes.get(stage, arm.demonstrations.node.config.episodes if arm.demonstrations else 1)
+    if stage in OF_RUNS:
+        return len(arm.starts) if stage == "evaluation" else 1
+    return arm.demonstrations.node.config.episodes if arm.demonstrations else 1
 
 
 def _told(known: float, is_known: bool) -> str:

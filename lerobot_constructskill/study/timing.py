@@ -32,6 +32,10 @@ class _Entry(TypedDict):
 ENTRY = Json("the time of a stage", _Entry)
 
 
+OF_RUNS = STAGES[2:]
+"""Stages that are made for each run; the others for each set that runs share."""
+
+
 @dataclass(frozen=True)
 class Took:
     """How long a stage took, over all of a study.
@@ -73,6 +77,11 @@ def time_by_stage(root: Path) -> list[Took]:
         runs[entry["stage"]] += entry["runs"]
         seconds[entry["stage"]] += entry["seconds"]
     return [Took(stage, runs[stage], seconds[stage]) for stage in STAGES if stage in runs]
+
+
+def seconds_of_one(entry: _Entry) -> float:
+    """How long a stage took for one run, or for one of the sets that runs share."""
+    return entry["seconds"] / (entry["runs"] if entry["stage"] in OF_RUNS else entry.get("nodes", 1))
 
 
 def entries(root: Path) -> Iterator[_Entry]:
