@@ -16,21 +16,13 @@ from lerobot_constructskill.board.entries import Entry
 from lerobot_constructskill.board.recovered import FAILED, Lost, Recovery, path_of, write_recovered
 from lerobot_constructskill.board.replay import jobs_of, open_simulator, open_workers
 from lerobot_constructskill.board.submission import Claim
-from lerobot_constructskill.board.takeover import (
-    EVERY,
-    Walk,
-    in_copy,
-    in_time,
-    last_step,
-    search,
-    with_extra_time,
-)
+from lerobot_constructskill.board.takeover import EVERY, Followed, Walk, Within
 from lerobot_constructskill.demos.state import PrivilegedState
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.progress import Progress
 
-TOGETHER = 2
-"""Episodes that a worker searches in one simulator: half a minute at most, as the bar moves when they are done."""
+TOGETHER = 6
+"""Episodes that a worker searches in one simulator: half a minute, as the bar moves when they are done."""
 
 DRAWN = 50
 """Of so many failures one is drawn by its hash, in which every tenth step is tried."""
@@ -92,25 +84,23 @@ def recover_episode(env: ConstructSkillEnv, claim: Claim, drawn: bool = False) -
         env: a simulator of its environment, which does not render.
         drawn: try every tenth step too.
     """
-    walk = Walk(env, claim)
-    told, states, end = in_copy(walk.follow)
-    if told is not None:
-        return Recovery(*claim.key, claim.steps, lost=Lost.UNSEEN, is_drawn=drawn)
-    tried = {claim.steps: end}
-    for holds in (with_extra_time, in_time(claim)):
-        tried = search(walk, tried, holds)
-    last = last_step(tried, with_extra_time)
+    walk, extra, in_time = Walk(env, claim), Within(), Within(claim.episode_length)
+    with Followed(walk) as followed:
+        if followed.told is not None:
+            return Recovery(*claim.key, claim.steps, lost=Lost.UNSEEN, is_drawn=drawn)
+        tried = followed.search(extra, in_time)
+        everywhere = followed.try_every(EVERY) if drawn else {}
+    last = extra.last(tried)
     after = tried.get(0 if last is None else last + 1)
     found: dict[str, Any] = {
-        "last_step": last_step(tried, in_time(claim)),
+        "last_step": in_time.last(tried),
         "last_step_extra": last,
-        "lost": cause(states, claim.executed[:, -1], last),
+        "lost": cause(followed.states, claim.executed[:, -1], last),
         "is_hopeless": after is not None and after.is_hopeless,
     }
     if last is not None:
-        found |= _where(walk, states[last])
-    if drawn:
-        tried = in_copy(lambda: walk.try_every(EVERY)) | tried
+        found |= _where(walk, followed.states[last])
+    tried = everywhere | tried
     steps = sorted(tried)
     took = [tried[step].took or FAILED for step in steps]
     return Recovery(*claim.key, claim.steps, **found, is_drawn=drawn, tried=steps, took=took)

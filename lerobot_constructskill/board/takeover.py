@@ -1,18 +1,13 @@
-"""Has the expert take over a failed episode, in copies of the process, which are the one exact snapshot of PhysX.
+"""Has the expert take over a failed episode, from steps of which copies of the process keep the state."""
 
-SAPIEN's `pack` keeps poses and velocities, but no contacts: after `unpack` a held object moves otherwise, and an
-episode may end in another step. A forked process keeps all, in milliseconds.
-"""
-
-import warnings
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from multiprocessing import get_context
+from functools import partial
+from typing import Self
 
 import numpy as np
 
-from lerobot_constructskill.artifacts.pools import DIED, be_killed_with_parent
+from lerobot_constructskill.board.forks import Fork, in_fork
 from lerobot_constructskill.board.recovered import PATIENCE, STRIDES
 from lerobot_constructskill.board.replay import difference
 from lerobot_constructskill.board.submission import Claim
@@ -20,16 +15,12 @@ from lerobot_constructskill.contract import get_task
 from lerobot_constructskill.demos.expert import Expert, ExpertConfig, make_expert
 from lerobot_constructskill.demos.state import PrivilegedState
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
-from lerobot_constructskill.errors import MachineError
 
 STILL = 0.0005
 """Metres that hand, fingers and object move at least in `PATIENCE` steps, unless the expert is stuck."""
 
 EVERY = 10
 """Steps between two attempts in an episode that is drawn to check the search."""
-
-LONGEST_S = 3600
-"""Seconds after which a copy that has not answered hangs: every tenth step of a wall of 2,000 takes minutes."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +36,23 @@ class Attempt:
     is_hopeless: bool
 
 
-type Holds = Callable[[int, Attempt], bool]
-"""Whether an attempt from a step counts as a recovery."""
+@dataclass(frozen=True)
+class Within:
+    """What counts as a recovery.
+
+    Args:
+        steps: in which the object has to be placed, counted from the episode's start; None for any number.
+    """
+
+    steps: int | None = None
+
+    def holds(self, step: int, attempt: Attempt) -> bool:
+        """Whether an attempt from a step is one."""
+        return attempt.took is not None and (self.steps is None or step + attempt.took <= self.steps)
+
+    def last(self, tried: dict[int, Attempt]) -> int | None:
+        """The last of the tried steps from which it was found."""
+        return max((step for step, attempt in tried.items() if self.holds(step, attempt)), default=None)
 
 
 @dataclass
@@ -99,126 +105,88 @@ class Walk:
                 return Attempt(step, False)
         return Attempt(None, hopeless > 0)
 
-    def follow(self) -> tuple[str | None, list[PrivilegedState], Attempt]:
-        """Execute the whole episode.
-
-        Returns:
-            What ends otherwise than claimed, as `replay.difference` says; the state before each action and after the
-            last, and the attempt from there.
-        """
-        states: list[PrivilegedState] = []
-        told = difference(self.env, self.claim, lambda: states.append(self.state))
-        return told, states, self.take_over()
-
     def try_every(self, steps: int) -> dict[int, Attempt]:
         """Attempts from every so many steps."""
         tried = {}
         for step in range(0, self.claim.steps, steps):
             self.go(step)
-            tried[step] = in_copy(self.take_over)
+            tried[step] = in_fork(self.take_over)
         return tried
 
+    def bisect(self, low: int, high: int, within: Within) -> dict[int, Attempt]:
+        """Go to a step that is a recovery; attempts between it and one that is none, each in the middle."""
+        self.go(low)
+        if high - low < 2:
+            return {}
+        middle = (low + high) // 2
+        tried = in_fork(partial(self._try_from, middle, high, within))
+        return tried if within.holds(middle, tried[middle]) else tried | self.bisect(low, middle, within)
 
-def in_time(claim: Claim) -> Holds:
-    """What counts as a recovery within the steps that an episode has."""
-    return lambda step, attempt: attempt.took is not None and step + attempt.took <= claim.episode_length
+    def _try_from(self, middle: int, high: int, within: Within) -> dict[int, Attempt]:
+        """The attempt from a step, and if it is a recovery, those of a bisection behind it."""
+        self.go(middle)
+        attempt = in_fork(self.take_over)
+        return {middle: attempt} | (self.bisect(middle, high, within) if within.holds(middle, attempt) else {})
 
 
-def with_extra_time(step: int, attempt: Attempt) -> bool:
-    """What counts as a recovery that may go on after the episode's end."""
-    return attempt.took is not None
-
-
-def last_step(tried: dict[int, Attempt], holds: Holds) -> int | None:
-    """The last of the tried steps from which a recovery was found."""
-    return max((step for step, attempt in tried.items() if holds(step, attempt)), default=None)
-
-
-def search(walk: Walk, tried: dict[int, Attempt], holds: Holds) -> dict[int, Attempt]:
-    """Try steps until the last tried recovery has a failure right behind it.
-
-    Recovery need not be monotone, so steps are tried from the back, a tenth of the episode apart. The stride behind
-    the first that holds is bisected.
+class Followed:
+    """A whole episode, executed once, of which copies of the process keep the state at every tenth part.
 
     Args:
-        walk: at the start of its episode, where it stays.
-        tried: attempts by step, that from the episode's end among them.
+        walk: at its start.
 
-    Returns:
-        `tried` and what was tried beside.
+    Attributes:
+        told: what ends otherwise than claimed, as `replay.difference` says.
+        states: before each action and after the last.
     """
-    for ways in (_backwards, _behind):
-        last = last_step(tried, holds)
-        low = -1 if last is None else last
-        high = min((step for step in tried if step > low), default=None)
-        if high is None:
-            return tried
-        tried = tried | ways(walk, low, high, holds)
-    return tried
+
+    def __init__(self, walk: Walk):
+        self.stride = max(walk.claim.steps // STRIDES, 1)
+        self.steps = walk.claim.steps
+        self.states: list[PrivilegedState] = []
+        self._walk, self._kept = walk, dict[int, Fork[Walk]]()
+
+    def __enter__(self) -> Self:
+        self.told = difference(self._walk.env, self._walk.claim, self._see)
+        return self
+
+    def __exit__(self, *_) -> None:
+        for fork in self._kept.values():
+            fork.close()
+
+    def _see(self) -> None:
+        at = len(self.states)
+        self.states.append(self._walk.state)
+        if at % self.stride == 0 and at < self.steps:
+            self._walk.at = at
+            self._kept[at] = Fork(self._walk)
+
+    def search(self, *criteria: Within) -> dict[int, Attempt]:
+        """Try steps until the last recovery, by each criterion, has a failure right behind it.
+
+        Recovery need not be monotone, so steps are tried from the back, a tenth of the episode apart. The stride
+        behind the first that is a recovery is bisected. The walk itself is behind its episode's end then.
+        """
+        tried = {self.steps: self._walk.take_over()}
+        for within in criteria:
+            low, high = _gap(tried, within)
+            for step in sorted((step for step in self._kept if low < step < high), reverse=True):
+                tried[step] = self._kept[step].ask(Walk.take_over)
+                if within.holds(step, tried[step]):
+                    break
+            low, high = _gap(tried, within)
+            if 0 <= low < high - 1:
+                kept = self._kept[low // self.stride * self.stride]
+                tried |= kept.ask(partial(Walk.bisect, low=low, high=high, within=within))
+        return tried
+
+    def try_every(self, steps: int) -> dict[int, Attempt]:
+        """Attempts from every so many steps."""
+        return self._kept[0].ask(partial(Walk.try_every, steps=steps))
 
 
-def _backwards(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
-    """The attempts from steps between two, a stride apart, the last first, until one holds."""
-    stride = max(walk.claim.steps // STRIDES, 1)
-    steps = range((low // stride + 1) * stride, high, stride)
-    return in_copy(lambda: _last_first(walk, steps, holds)) if steps else {}
-
-
-def _last_first(walk: Walk, steps: range, holds: Holds) -> dict[int, Attempt]:
-    walk.go(steps[0])
-    behind = in_copy(lambda: _last_first(walk, steps[1:], holds)) if steps[1:] else {}
-    return behind if last_step(behind, holds) is not None else behind | {steps[0]: in_copy(walk.take_over)}
-
-
-def _behind(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
-    """The attempts of a bisection between a step that holds, or -1, and one that does not."""
-
-    def bisect_from_low() -> dict[int, Attempt]:
-        walk.go(max(low, 0))
-        return _bisect(walk, low, high, holds)
-
-    return in_copy(bisect_from_low)
-
-
-def _bisect(walk: Walk, low: int, high: int, holds: Holds) -> dict[int, Attempt]:
-    """The same, of a walk that is at the lower step."""
-    if high - low < 2:
-        return {}
-    middle = (low + high) // 2
-    tried = in_copy(lambda: _from_middle(walk, middle, high, holds))
-    return tried if holds(middle, tried[middle]) else tried | _bisect(walk, low, middle, holds)
-
-
-def _from_middle(walk: Walk, middle: int, high: int, holds: Holds) -> dict[int, Attempt]:
-    """The attempt from a step, and if it holds, those of a bisection behind it."""
-    walk.go(middle)
-    attempt = in_copy(walk.take_over)
-    return {middle: attempt} | (_bisect(walk, middle, high, holds) if holds(middle, attempt) else {})
-
-
-def in_copy[Result](work: Callable[[], Result]) -> Result:
-    """Call a function in a copy of this process, whose simulator goes its own way.
-
-    Raises:
-        OSError: the copy died.
-    """
-    context = get_context("fork")
-    receiver, sender = context.Pipe(duplex=False)
-    copy = context.Process(target=_answer, args=(work, sender))
-    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of threads, which wait in C
-        copy.start()
-    sender.close()
-    try:
-        if not receiver.poll(LONGEST_S):
-            raise EOFError
-        return receiver.recv()
-    except EOFError:
-        raise MachineError(DIED) from None
-    finally:
-        copy.kill()
-        copy.join()
-
-
-def _answer(work: Callable[[], object], sender) -> None:
-    be_killed_with_parent()
-    sender.send(work())
+def _gap(tried: dict[int, Attempt], within: Within) -> tuple[int, int]:
+    """The last step that is a recovery, or -1, and the next one that was tried, or itself."""
+    last = within.last(tried)
+    low = -1 if last is None else last
+    return low, min((step for step in tried if step > low), default=low)
