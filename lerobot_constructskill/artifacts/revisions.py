@@ -16,10 +16,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
+from time import monotonic
 from typing import Any, TypedDict
 
 from lerobot_constructskill.artifacts.digests import digest, file_sha256, stamp
@@ -33,6 +34,9 @@ PREFIX = "constructskill."
 
 LEFT_OUT = re.compile(r"(^|/)(\.|__pycache__/|[^/]*(~|\.pyc|\.swp|\.log)$|4913$)")
 """Files beside a package's own: hidden ones, bytecode, logs, and what editors leave for as long as a file is open."""
+
+LOOKED_AT_S = 1.0
+"""Seconds for which the files of a room are not looked at again: the status of all studies asks 46,000 times."""
 
 EDITED = "edited: "
 """Before the file where the source stands in place of a revision."""
@@ -95,19 +99,28 @@ def _table(path: Path, size: int, mtime_ns: int) -> dict[str, Room]:
 
 
 def sources(room: Room) -> dict[str, str]:
-    """The hash of each file of a room, by its path below the package.
+    """The hash of each file of a room, by its path below the package, as of the last second.
 
     Raises:
         MachineError: one of its files or folders is not there.
     """
-    return {name: _hash(*stamp(PACKAGE / name)) for name in files_of(room)}
+    return _seen(PACKAGE, (*room["holds"],), int(monotonic() / LOOKED_AT_S))
+
+
+@lru_cache(maxsize=100)
+def _seen(package: Path, holds: tuple[str, ...], second: int) -> dict[str, str]:
+    return {name: _hash(*stamp(package / name)) for name in _files_below(package, holds)}
 
 
 def files_of(room: Room) -> Iterator[str]:
-    """The files of a room, by their paths below the package. It is asked for with every specification."""
-    above = len(f"{PACKAGE}{os.sep}")
-    for held in room["holds"]:
-        if not os.path.exists(path := f"{PACKAGE}{os.sep}{held}"):
+    """The files of a room, by their paths below the package."""
+    return _files_below(PACKAGE, room["holds"])
+
+
+def _files_below(package: Path, holds: Iterable[str]) -> Iterator[str]:
+    above = len(f"{package}{os.sep}")
+    for held in holds:
+        if not os.path.exists(path := f"{package}{os.sep}{held}"):
             raise MachineError(f"{path}, of the table of revisions, is not there: install the package again.")
         if os.path.isfile(path):
             yield held

@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,7 @@ def copy(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "lerobot_constructskill"
     shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(module, "PACKAGE", folder)
+    monkeypatch.setattr(module, "LOOKED_AT_S", 1e-9)
     monkeypatch.setattr(module, "TABLE", folder / TABLE.relative_to(PACKAGE))
     return folder
 
@@ -126,6 +128,15 @@ def test_a_file_that_is_new_or_gone_is_an_edit(copy):
     assert "edited" not in revisions(DEMOS)["constructskill.demos"], "a link to nothing"
     (copy / "demos" / "state.py").unlink()
     assert revisions(DEMOS)["constructskill.demos"].endswith(", edited: demos/state.py")
+
+
+def test_an_edit_is_seen_in_a_second(copy, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(module, "PACKAGE", copy)
+    before = revisions(DEMOS)
+    edit(copy / "demos" / "expert.py", "    gain: Gain = 1.0", "    gain: Gain = 1.1")
+    time.sleep(module.LOOKED_AT_S)
+    assert revisions(DEMOS) != before
 
 
 def test_a_renamed_variable_costs_nothing_once_it_is_recorded(copy):

@@ -1012,6 +1012,7 @@ def test_an_edited_line_of_ours_makes_exactly_what_depends_on_it_stale(file, cop
     text = (copied / file).read_text()
     assert old in text
     monkeypatch.setattr(revisions, "PACKAGE", copied)
+    monkeypatch.setattr(revisions, "LOOKED_AT_S", 1e-9)
     (copied / file).write_text(text.replace(old, new, 1))
     try:
         now = everything_of(of)
