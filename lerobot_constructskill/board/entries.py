@@ -237,14 +237,16 @@ def _entry(root: Path, path: Path) -> Entry:
 def ranks(entries: list[Entry], setting: str) -> dict[str, tuple[int, bool]]:
     """Rank of each entry that has one in a setting, and whether it is shared.
 
-    Only entries of one class that were evaluated alike are compared: a custom entry names its settings. An entry is
+    Only entries of one class that were evaluated alike are compared: a custom entry names its settings. Those of which
+    each seed learnt from a draw of its own are compared with each other alone. An entry is
     behind those whose interval over seeds lies wholly above its own, so an entry that no seeds put behind another has
     rank 1. Two intervals that overlap can have different ranks: a third may lie above one of them alone.
     """
     alike: dict[tuple, dict[str, Estimate]] = {}
     for entry in entries:
         if entry.is_ranked and setting in entry.standings:
-            kind = entry.declaration.settings_class, entry.declaration.settings[setting].compared
+            said = entry.declaration
+            kind = said.settings_class, said.settings[setting].compared, said.about.demonstrations == "own"
             alike.setdefault(kind, {})[entry.name] = entry.standings[setting].placed
     found = {}
     for placed in alike.values():

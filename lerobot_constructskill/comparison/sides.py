@@ -60,6 +60,7 @@ class Side:
         versions: packages, processor and simulator that its episodes were made with.
         draws: which training seeds share demonstrations; None if that is not known.
         numbers: the training seeds' numbers, in the order of `seeds`; empty if they are not known.
+        learnt_from: hashes of the demonstrations; empty if they are not known.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Side:
     versions: dict[str, str]
     draws: Draws | None = None
     numbers: Sequence[int] = ()
+    learnt_from: Sequence[str] = ()
 
     @property
     def covered(self) -> str | None:
@@ -243,6 +245,7 @@ def read_study(root: Path, arm: str) -> Side:
         versions=merged(_versions(text, backend) for text, backend in made_with),
         draws=read_draws(root),
         numbers=sorted(int(number) for number in rows["training_seed"].unique()),
+        learnt_from=sorted({*rows["dataset_sha256"].dropna()}),
     )
 
 

@@ -173,14 +173,22 @@ def _power(judgement: Judgement, alpha: float, unit: str) -> str:
 
 
 def _covered(matched: MatchedSides) -> str:
-    """What the intervals are over, and that the sides differ in it."""
+    """What the intervals are over, and that the sides differ in it or in what they learnt from."""
     a, b = matched.a.covered, matched.b.covered
-    if a == b:
-        return f"The intervals hold for {a}." if a else ""
-    told = {letter: f"{letter}'s interval holds for {one}." for letter, one in (("A", a), ("B", b)) if one}
-    missing = [f"What {letter}'s holds for, its files do not say." for letter in "AB" if letter not in told]
+    learnt = matched.a.learnt_from, matched.b.learnt_from
     units = [f"A unit is a {matched.a.unit} of A and a {matched.b.unit} of B."] if _unit(matched) == "unit" else []
-    return " ".join([*units, *told.values(), *missing, "Demonstrations can make the difference as well as policies."])
+    if a == b:
+        told = [f"The intervals hold for {a}."] if a else []
+    else:
+        covered = {letter: f"{letter}'s interval holds for {one}." for letter, one in (("A", a), ("B", b)) if one}
+        missing = [f"What {letter}'s holds for, its files do not say." for letter in "AB" if letter not in covered]
+        told = [*covered.values(), *missing]
+    differ = all(learnt) and learnt[0] != learnt[1]
+    if differ:
+        told.append("A and B learnt from different demonstrations.")
+    if differ or a != b:
+        told.append("Demonstrations can make the difference as well as policies.")
+    return " ".join([*units, *told])
 
 
 def _versions(*each: MatchedSides) -> str:

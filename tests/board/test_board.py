@@ -141,6 +141,10 @@ def test_ranks_are_of_seeds_and_ties_are_ties(many):
     easier = replace(good.declaration, settings={"block_to_bin": setting})
     other = replace(good, name="other", submission=replace(good.submission, declaration=easier))
     assert ranks([bad, other], "block_to_bin") == {"bad": (1, False), "other": (1, False)}, "from other starts"
+    about = replace(bad.declaration.about, demonstrations="own")
+    drawn = replace(bad.submission, declaration=replace(bad.declaration, about=about))
+    own = replace(bad, name="own", submission=drawn)
+    assert ranks([good, bad, own], "block_to_bin") == {"good": (1, False), "bad": (2, False), "own": (1, False)}
 
 
 def test_only_what_was_replayed_is_for_the_boards_of_others(committed, many, tmp_path):

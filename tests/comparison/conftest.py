@@ -30,9 +30,11 @@ def study(tmp_path):
         env: dict = ENV,
         starts: Sequence = STARTS,
         draws: dict | None = None,
+        data: str | None = None,
     ) -> str:
         draws = draws or {}
         common = {"run": None, "setting": "block", "variant": "ours", "role": VARIANT, "episodes": len(starts)}
+        common["dataset_sha256"] = data
         common["versions"] = json.dumps({"lerobot": "0.6.1", "torch": name, "processor": "a CPU"})
         rows = []
         for seed, count in enumerate(placed):

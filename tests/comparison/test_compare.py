@@ -104,6 +104,12 @@ def test_rows_over_draws_are_not_compared_with_rows_of_one_draw_in_silence(study
     assert "What A's holds for, its files do not say." in tell(compared(recorded(GOOD), one), 0.05)
 
 
+def test_two_rows_of_one_draw_each_say_where_the_draws_are_two(study):
+    one, same, other = study(GOOD, data="aa"), study(BAD, "same", data="aa"), study(BAD, "other", data="bb")
+    told = "A and B learnt from different demonstrations. Demonstrations can make the difference"
+    assert told not in tell(compared(one, same), 0.05) and told in tell(compared(one, other), 0.05)
+
+
 def test_draws_with_starts_of_their_own_are_compared_with_the_same_draws(study, checkpoints):
     own = {"demonstrations": "own", "starts": "own"}
     comparison = compared(study(GOOD, draws=own), study(BAD, "other", draws=own))
@@ -148,6 +154,8 @@ def test_seeds_of_one_draw_count_as_one(study, recorded):
     unknown = tell(compared(pairs, recorded([5] * 6)), 0.05)
     assert "A unit is a draw of A and a seed of B." in unknown and "None" not in unknown
     assert "What B's holds for, its files do not say." in unknown
+    alone = tell(compared(study([9, 2, 5], "one a draw", draws={"demonstrations": "own"}), other), 0.05)
+    assert "A unit is a seed of A and a draw of B." in alone, "though their intervals hold for the same"
     assert "Make more draws of both." in tell(
         compared(study([9, 7], "a", draws=draws), study([1, 2], "b", draws=draws)), 0.05
     )
