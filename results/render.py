@@ -16,6 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import chain, repeat
 from pathlib import Path
 from statistics import median
 
@@ -25,7 +26,7 @@ import pandas as pd
 from lerobot_constructskill.analysis.report.formats import in_points, percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate, clopper_pearson, mean_rate
 from lerobot_constructskill.analysis.stats.outcomes import CRITERIA, by_unit, chance_of, count, runs_of
-from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_means, read_rows
+from lerobot_constructskill.study.rows import ROWS, Draws, read_draws, read_environments, read_means, read_rows
 from lerobot_constructskill.study.timing import STAGES, entries, seconds_of_one
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +39,9 @@ PAGES = [
 
 OFTEN = ["", "", " (two)", " (three)", " (four)", " (five)", " (six)", " (seven)", " (eight)", " (nine)", " (ten)"]
 """How often a number stands in a list; above, in digits."""
+
+
+NOT_YET = "not run yet"
 
 
 class Arm:
@@ -98,11 +102,10 @@ class Arm:
         return f"{self.rates('placed').min() * self.runs['episodes'].max():g}"
 
     def spread(self) -> str:
-        rates = self.rates("placed")
-        if len(rates) < 2:
+        if len(self.rates("placed")) < 2:
             return "–"
         chance = chance_of(self.rows, "placed") if self.units.is_unique else None
-        return f"{in_points(rates.std())}, {in_points(chance)}"
+        return f"{in_points(self.runs['placed_rate'].std(ddof=0))}, {in_points(chance)}"
 
     def each(self) -> str:
         often = Counter(sorted(self.runs["placed"]))
@@ -200,16 +203,15 @@ def _lines(page: Path, text: str | None = None) -> Iterator[tuple[str, list[str]
     @cache
     def arms(file: str, name: str) -> Arm | None:
         own = study((page.parent / file).resolve().parent)
-        return Arm(*own, name) if own else None
+        return Arm(*own, name) if own and not _is_planned(*own[:2], name) else None
 
     for line in (page.read_text(encoding="utf-8") if text is None else text).splitlines():
         cells = [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] if line.startswith("|") else []
         heads = (heads or cells) if cells else []
         if cells and (row := next((one for one in LINK.finditer(line) if one["word"] is None), None)):
             arm = arms(row["file"], row["arm"])
-            cells = [
-                _tell(arm, HEADS[head]) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)
-            ]
+            told = _numbers(arm, [head for head in heads if head in HEADS])
+            cells = [next(told) if head in HEADS else cell for head, cell in zip(heads, cells, strict=True)]
             line = f"| {' | '.join(cells)} |"
         yield LINK.sub(lambda one: _linked(one, arms), line), heads, cells
 
@@ -223,8 +225,17 @@ def _study(folder: Path) -> tuple[Path, pd.DataFrame, Draws, dict[str, list[str]
     return None
 
 
-def _tell(arm: Arm | None, number: Callable[[Arm], str]) -> str:
-    return "not run yet" if arm is None or arm.runs.empty else number(arm)
+def _is_planned(folder: Path, rows: pd.DataFrame, name: str) -> bool:
+    """Whether no run of a setting of a study has been made, or its draws have no rows."""
+    setting = name.split("/")[0]
+    return setting in read_environments(folder) and setting not in {*rows["setting"]}
+
+
+def _numbers(arm: Arm | None, heads: list[str]) -> Iterator[str]:
+    """What a row says below some heads."""
+    if arm is None or arm.runs.empty:
+        return chain([NOT_YET], repeat("–"))
+    return (HEADS[head](arm) for head in heads)
 
 
 def _linked(link: re.Match[str], arms: Callable[[str, str], Arm | None]) -> str:
@@ -232,7 +243,8 @@ def _linked(link: re.Match[str], arms: Callable[[str, str], Arm | None]) -> str:
     arm = arms(link["file"], link["arm"])
     if link["word"] is None:
         return link[0]
-    text = _tell(arm, WORDS[link["word"]])
+    is_there = arm is not None and not arm.runs.empty
+    text = WORDS[link["word"]](arm) if is_there else "0" if link["word"] == "draws" else NOT_YET
     return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
 
 

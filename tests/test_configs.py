@@ -126,11 +126,11 @@ def seeds_of(runs):
     return set(chain(*lists, *(run.plan.config.starts for run in runs if run.plan)))
 
 
-def test_nothing_was_chosen_on_draws_starts_or_seeds_that_are_reported():
-    runs = {path.stem: list_runs(parse(StudyConfig, [], path).study) for path in STUDIES}
-    reported = seeds_of(runs.pop("draws"))
-    for name, others in runs.items():
-        assert not reported & seeds_of(others), name
+def test_nothing_was_chosen_on_draws_or_starts_that_are_reported():
+    seeds = {path.stem: seeds_of(list_runs(parse(StudyConfig, [], path).study)) for path in STUDIES}
+    for reported in ("draws", "draws_number"):
+        for name, others in seeds.items():
+            assert name == reported or not seeds[reported] & others, f"{reported} and {name}"
 
 
 @pytest.mark.parametrize("choice", [path.stem for path in STUDIES if path.stem.endswith("_choice")])

@@ -191,6 +191,13 @@ def test_an_arm_that_nobody_made_is_no_number(tmp_path):
         render.render(page)
     page.write_text('[](walls/report.md "placed course_of_three/precise")\n')
     assert render.render(page).startswith("[not run yet]"), "a study without rows"
+    study = SMALL | {"settings": SMALL["settings"] | {"later": SMALL["settings"]["fixed"]}}
+    write_study(tmp_path, study, missing_rows(SMALL))
+    page.write_text(
+        "| | placed | lifted | rows |\n|---|---|---|---|\n"
+        f'| [1]({small} "draws later/one") | | | [s]({small} "later/one") |\n'
+    )
+    assert "| not run yet | – |" in render.render(page) and "[0](" in render.render(page), "a setting without rows"
     page.write_text('[](wals/report.md "placed course_of_three/precise")\n')
     with pytest.raises(SystemExit, match="names wals, which is no study"):
         render.render(page)

@@ -73,6 +73,12 @@ class VariantFindings:
         return self.runs[self.runs["error_kind"].notna()]
 
     @property
+    def measured(self) -> str:
+        """Of how many runs the held-out error is, where it is not of all."""
+        known, runs = self.runs["heldout_mse_m2"].count(), len(self.runs)
+        return f" (of {known} of {runs} seeds)" if 0 < known < runs else ""
+
+    @property
     def absence(self) -> str:
         """Why `success` is empty."""
         return "not run yet" if self.failures.empty else "no run finished"
@@ -195,9 +201,13 @@ class Findings:
 
     @property
     def sections(self) -> list[SettingFindings]:
-        """Settings with a section of their own: a sweep's later settings have one only if they compare variants."""
+        """Settings with a section: a sweep's later ones have it if they compare variants or split a spread."""
         swept = {setting.name for sweep in self.sweeps for setting in sweep.settings[1:]}
-        return [setting for setting in self.settings if setting.name not in swept or len(setting.variants) > 1]
+        return [
+            setting
+            for setting in self.settings
+            if setting.name not in swept or len(setting.variants) > 1 or setting.drawn
+        ]
 
     @property
     def swept_labels(self) -> list[str]:
