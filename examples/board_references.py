@@ -23,7 +23,7 @@ from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import FOLDER
 from lerobot_constructskill.errors import DISTRIBUTION
 from lerobot_constructskill.rollout.agents import Agent, Observation
-from lerobot_constructskill.rollout.references import REFERENCES, ExpertAgent, NoOpAgent
+from lerobot_constructskill.rollout.references import REFERENCES, ExpertAgent, NoOpAgent, ReplayAgent
 
 TRAINING_SEED = 0
 TOGETHER = 10
@@ -32,20 +32,14 @@ SEES = {"expert": "privileged"}
 """What a reference observes; nothing by default."""
 
 
-class OpenLoop(NoOpAgent):
+class OpenLoop(ReplayAgent):
     """What the expert executes from the first start of a data set, wherever it is; then it stands still."""
 
     def __init__(self, task: Task):
-        super().__init__(task)
+        NoOpAgent.__init__(self, task)
         env = ConstructSkillEnv(task.name, render_backend="none")
         self.actions = list(act(env, ExpertAgent(task), DEMO_SEED_START))
         env.close()
-
-    def reset(self, seed: int) -> None:
-        self.remaining = iter(self.actions)
-
-    def act(self, observation: Observation) -> np.ndarray:
-        return next(self.remaining, self.still)
 
 
 def act(env: ConstructSkillEnv, agent: Agent, seed: int) -> list[np.ndarray]:

@@ -227,9 +227,9 @@ class Yaml[Kind](Json[Kind]):
         return _yaml(text, self.loader)
 
 
-def parse_yaml(text: str, where: str, loader: type[Loader] = Loader) -> Any:
-    """The value of a text that stands at `where`. Raises InputError where it is no YAML."""
-    return _plain(lambda: _yaml(text, loader), f"{where} cannot be read")
+def parse_yaml(text: str) -> Any:
+    """The value of a text. Raises InputError where it is no YAML."""
+    return _plain(lambda: _yaml(text, Loader), "It cannot be read")
 
 
 def _yaml(text: str, loader: type[Loader]) -> Any:

@@ -95,7 +95,7 @@ def _value(text: str, kind: Any) -> Any:
     if not text or {*_alternatives(kind)} <= {str, Path} or (text != "null" and {*_alternatives(kind)} <= TEXTS):
         return text
     try:
-        return parse_yaml(text, "It")
+        return parse_yaml(text)
     except InputError:
         return text
 

@@ -39,7 +39,7 @@ from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
-from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Draws, Row, load_rows, read_rows
+from lerobot_constructskill.study.rows import NOT_RUN, ROWS, Row, load_rows, read_rows
 from lerobot_constructskill.study.runs import Run
 from lerobot_constructskill.study.session import run_study
 from lerobot_constructskill.study.spec import Options, Study
@@ -104,7 +104,7 @@ class Piece:
 
 def pieces_of(name: str, study: Study) -> Iterator[Piece]:
     """The pieces of a study, in its order."""
-    draws = Draws(study.demonstrations, study.starts, study.seeds_a_draw)
+    draws = study.draws
     is_many = any(draws.of(seed) for of in study.variants.values() for seed in of.training_seeds)
 
     def title(run: Run) -> str:

@@ -6,12 +6,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
-def _order(page: Path) -> tuple[bool, str]:
-    """One in which their commands can be run: other pages go on from the first run."""
-    return page.name != "first_run.md", page.name
-
-
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"), key=_order)]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 BLOCK = re.compile(r"^```bash\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`((?:constructskill|lerobot)-[a-z-]+ [^`]+)`")

@@ -204,7 +204,7 @@ def test_nothing_is_converted_and_nothing_dropped():
     ],
 )
 def test_yaml_is_what_it_looks_like(text, value):
-    assert parse_yaml(text, "It") == value and type(parse_yaml(text, "It")) is type(value)
+    assert parse_yaml(text) == value and type(parse_yaml(text)) is type(value)
     assert not isinstance(value, date)
 
 
@@ -221,7 +221,7 @@ def test_yaml_is_what_it_looks_like(text, value):
 )
 def test_yaml_does_not_say_two_things(text, said):
     with pytest.raises(InputError, match=said):
-        parse_yaml(text, "It")
+        parse_yaml(text)
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,12 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from printed import PAGES
 
 from lerobot_constructskill.contract import SHIPPED
 from lerobot_constructskill.perturbations import AXES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LINES = {"README.md": 150, "CHANGELOG.md": 60, "docs/results.md": 200}
 
 

@@ -112,12 +112,8 @@ def _seen(package: Path, holds: tuple[str, ...], second: int) -> dict[str, str]:
     return {name: _hash(*stamp(package / name)) for name in _files_below(package, holds)}
 
 
-def files_of(room: Room) -> Iterator[str]:
-    """The files of a room, by their paths below the package."""
-    return _files_below(PACKAGE, room["holds"])
-
-
 def _files_below(package: Path, holds: Iterable[str]) -> Iterator[str]:
+    """The files of a room, by their paths below the package."""
     above = len(f"{package}{os.sep}")
     for held in holds:
         if not os.path.exists(path := f"{package}{os.sep}{held}"):

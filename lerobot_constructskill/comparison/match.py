@@ -121,7 +121,10 @@ def finish(prepared: Prepared, evaluate: Evaluate, alpha: float) -> MatchedSides
     )
     either = set.union(*apart) if apart else set.union(*(side.starts or set() for side in (a, b)))
     rates_a, rates_b = (
-        [_rate([placed[start] for start in starts if start in placed]) if placed else 0.0 for placed in side.seeds]
+        [
+            float(np.mean([placed[start] for start in starts if start in placed])) if placed else 0.0
+            for placed in side.seeds
+        ]
         for side in (a, b)
     )
     return MatchedSides(
@@ -157,10 +160,6 @@ def chance(sides: Sequence[Side], starts: Sequence[Sequence[int]]) -> float | No
             for side, own in zip(sides, starts, strict=True)
         ]
     )
-
-
-def _rate(placed: Sequence[bool]) -> float:
-    return float(np.mean(placed))
 
 
 def _starts_apart(known: Sequence[Side]) -> list[set[int]] | None:

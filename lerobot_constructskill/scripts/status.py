@@ -35,7 +35,3 @@ def status(config: StatusConfig) -> str:
     changed = {path.parent: outdated(path.parent) for path in found}
     stale = [f"{folder}: made with another {', '.join(what)}" for folder, what in changed.items() if what]
     return "\n".join([*stale, f"{plural(len(found), 'folder')}, {len(stale)} of them made with other code"])
-
-
-if __name__ == "__main__":
-    status.main()

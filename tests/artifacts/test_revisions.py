@@ -12,7 +12,7 @@ import yaml
 
 from lerobot_constructskill.artifacts import revisions as module
 from lerobot_constructskill.artifacts.code import code_of
-from lerobot_constructskill.artifacts.revisions import PACKAGE, TABLE, files_of, read_table, revisions, sources
+from lerobot_constructskill.artifacts.revisions import PACKAGE, TABLE, read_table, revisions, sources
 from lerobot_constructskill.errors import InputError, MachineError
 
 INERT = {
@@ -87,7 +87,7 @@ def test_a_room_stands_on_what_it_imports():
 
 
 def paths_of(room) -> list[Path]:
-    return [PACKAGE / name for name in files_of(room)]
+    return [PACKAGE / name for name in sources(room)]
 
 
 def dotted(path: Path) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import call
+from toy import rows
 
 from lerobot_constructskill.artifacts.digests import data_sha256
 from lerobot_constructskill.contract import TASKS
@@ -24,16 +25,6 @@ from lerobot_constructskill.errors import InputError
 pytestmark = pytest.mark.slow
 
 VIDEO = "videos/observation.images.base/chunk-000/file-000.mp4"
-
-
-def rows(change):
-    """A corruption of data/: `change` takes the rows and returns them."""
-
-    def corrupt(root):
-        path = root / "data/chunk-000/file-000.parquet"
-        change(pd.read_parquet(path)).to_parquet(path)
-
-    return corrupt
 
 
 def metadata(name, change):

@@ -1,8 +1,6 @@
 """A data set of several tasks, made by the toy: what it says of each, and what every reader makes of it."""
 
 import json
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,7 +8,7 @@ import pytest
 from commands import call
 from lerobot.datasets import LeRobotDataset
 from torch.utils.data import DataLoader
-from toy import record_toy
+from toy import record_toy, rows
 
 from lerobot_constructskill.contract import DEMO_SEED_START, SUITES, TASK_NAME, TASKS
 from lerobot_constructskill.dataset.card import card_facts, render
@@ -41,11 +39,6 @@ def pristine(tmp_path_factory):
     root = tmp_path_factory.mktemp("many") / "set"
     record_toy(root, 3, task="bins", action="full", annotate=True)
     return root
-
-
-@pytest.fixture
-def copy(pristine, tmp_path):
-    return Path(shutil.copytree(pristine, tmp_path / "set"))
 
 
 def test_a_set_of_several_tasks_passes_every_check(pristine):
@@ -165,14 +158,6 @@ def episodes(change):
     def corrupt(root):
         for path in (root / "meta/episodes").rglob("*.parquet"):
             change(pd.read_parquet(path)).to_parquet(path)
-
-    return corrupt
-
-
-def rows(change):
-    def corrupt(root):
-        path = root / "data/chunk-000/file-000.parquet"
-        change(pd.read_parquet(path)).to_parquet(path)
 
     return corrupt
 

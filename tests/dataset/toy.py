@@ -4,6 +4,7 @@ The experts, the noise, the recorder and the video encoder are the real ones.
 """
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from lerobot_constructskill.contract import (
@@ -102,3 +103,13 @@ def record_toy(root, episodes, **fields):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shards, "_environment", ToyEnv)
         record(GenerateConfig("local/toy", str(root), episodes=episodes, **fields))
+
+
+def rows(change):
+    """A corruption of data/: `change` takes the rows and returns them."""
+
+    def corrupt(root):
+        path = root / "data/chunk-000/file-000.parquet"
+        change(pd.read_parquet(path)).to_parquet(path)
+
+    return corrupt

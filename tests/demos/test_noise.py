@@ -60,6 +60,10 @@ def test_a_covariance_without_full_rank_is_drawn_from():
 @pytest.mark.parametrize(
     "bad, word",
     [
+        ({"sigma": -0.01}, "-0.01"),
+        ({"sigma": float("nan")}, "sigma"),
+        ({"clip": 0}, "clip"),
+        ({"phases": ["LFT"]}, "LIFT"),
         ({"model": "white"}, "isotropic"),
         ({"model": "dart"}, "constructskill-fit-noise"),
         ({"model": "dart", "covariance": [[1.0]]}, "3 x 3"),
