@@ -27,6 +27,7 @@ from tempfile import TemporaryDirectory
 from entries import drop, keep, whole, write_entries
 from render import PAGES, make_of, render
 
+from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.artifacts.folders import write_text
 from lerobot_constructskill.artifacts.processor import processor
 from lerobot_constructskill.artifacts.store import Node, Store
@@ -35,7 +36,6 @@ from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.console import Parser, edge, say
-from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.study.estimates import Estimates
 from lerobot_constructskill.study.plan import list_runs
@@ -258,7 +258,7 @@ class Maker:
 
         Then write the entries of the board that it was the last piece of, and commit these.
         """
-        report(ReportConfig(self.folder(piece.study)))
+        write_report(self.folder(piece.study))
         for page in self._pages:
             write_text(page, render(page))
         folder, board = self.folder(piece.study), self.root / "board"

@@ -16,13 +16,13 @@ from tokenizers.pre_tokenizers import Whitespace
 from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
 from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
+from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.contract import ORDERS, TASKS
 from lerobot_constructskill.demos.recorder import GenerateConfig, record
 from lerobot_constructskill.parsing import read_fields
 from lerobot_constructskill.presets import find
 from lerobot_constructskill.scripts.config import ConfigConfig, write
 from lerobot_constructskill.scripts.held_out import OfflineConfig, evaluate_offline
-from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.study.rows import ROWS, VARIANT, read_rows
 
 pytestmark = [pytest.mark.sim, pytest.mark.nightly]
@@ -180,7 +180,7 @@ def test_the_study_of_vlas_runs_whole(smolvla_base, folder):
     assert all(sorted(one["setting"]) == sorted(ORDERS) for _, one in trained) and len(trained) == 4
     assert (trained["weights_sha256"].nunique() == 1).all(), "one policy for all four"
 
-    page = report(ReportConfig(root)).with_suffix(".md").read_text()
+    page = write_report(root).with_suffix(".md").read_text()
     of_means = page.partition("\n## all orders\n")[2].partition("\n## ")[0]
     means, spread = of_means.split("### The same comparisons of the spread over seeds")
     pair = "| SmolVLA, fine-tuned v frozen\\_vit, told by language |"

@@ -13,13 +13,13 @@ import pytest
 import yaml
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.artifacts.digests import installed
 from lerobot_constructskill.dagger.plan import Plan
 from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.lerobot_internals import load_plugins
 from lerobot_constructskill.parsing import parse
 from lerobot_constructskill.scripts.held_out import FitNoiseConfig, OfflineConfig, evaluate_offline, fit_noise
-from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.scripts.study import StudyConfig, study
 from lerobot_constructskill.scripts.submit import SubmitConfig, submit
 from lerobot_constructskill.scripts.verify import VerifyConfig, verify
@@ -117,7 +117,7 @@ def test_it_is_trained_evaluated_and_reported_with_its_held_out_error(folder, st
     assert len(mine) == 2 and not mine["error_kind"].notna().any(), mine["error"].tolist()
     assert mine["heldout_mse_m2"].between(1e-7, 0.1).all() and mine["heldout_mse_m2"].nunique() == 2
     assert mine["versions"].str.contains(rf'"{PLUGIN}": "0.1.0, source [0-9a-f]{{12}}"').all()
-    report(ReportConfig(folder / "study"))
+    write_report(folder / "study")
     told = [line for line in (folder / "study" / "report.md").read_text().splitlines() if line.startswith("| mine")]
     assert f"{mine['heldout_mse_m2'].mean() * 1e4:.2f}" in told[0]
 

@@ -88,30 +88,14 @@ def card_of(
     train: Mapping[str, Any],
     flags: str = "",
 ) -> str:
-    """The card of a policy in a folder, as `render_card` makes it."""
-    record = checkpoint / "encoder.json"
-    encoder = OBJECT.read(record) if record.is_file() else {}
-    return render_card(repo_id, outcomes, task, train, OBJECT.read(checkpoint / "config.json"), encoder, flags)
-
-
-def render_card(
-    repo_id: str,
-    outcomes: list[tuple[int, int, int, int]],
-    task: str,
-    train: Mapping[str, Any],
-    policy: dict[str, Any],
-    encoder: dict[str, Any],
-    flags: str = "",
-) -> str:
     """The card of a policy, in Markdown.
 
     Args:
+        checkpoint: the folder of its `config.json` and, where it has one, its `encoder.json`.
         train: `train_config.json` (`TRAINED`).
-        policy: the checkpoint's `config.json`.
-        encoder: its `encoder.json`; empty for a policy without one.
         flags: what `lerobot-eval` needs beside the policy and the task; "" where they are not known.
     """
-    data = train.get("dataset", {})
+    record, data = checkpoint / "encoder.json", train.get("dataset", {})
     return render_template(
         "policy_card.md.j2",
         repo_id=repo_id,
@@ -120,7 +104,7 @@ def render_card(
         this_seed=train.get("seed"),
         dataset=data.get("repo_id"),
         revision=data.get("revision"),
-        policy=policy,
-        encoder=encoder,
+        policy=OBJECT.read(checkpoint / "config.json"),
+        encoder=OBJECT.read(record) if record.is_file() else {},
         flags=flags,
     )

@@ -19,18 +19,8 @@ class ReportConfig(Checked):
     root: Path  # the study's folder
 
 
-def report(config: ReportConfig) -> Path:
-    """Write a report and return its page.
-
-    Raises:
-        MissingError: the folder holds no study.
-        InputError: its files cannot be read, or do not belong together.
-    """
+@command("constructskill-report --root=outputs/study/smoke")
+def report(config: ReportConfig) -> str:
     from lerobot_constructskill.analysis.report.page import write_report
 
-    return write_report(config.root)
-
-
-@command("constructskill-report --root=outputs/study/smoke")
-def tell_report(config: ReportConfig) -> str:
-    return f"Report written to {report(config)}"
+    return f"Report written to {write_report(config.root)}"

@@ -30,12 +30,11 @@ from synthetic_study import (
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.analysis.report.figures import seeds_figure
 from lerobot_constructskill.analysis.report.formats import p_value, signed, times
-from lerobot_constructskill.analysis.report.page import read_study
+from lerobot_constructskill.analysis.report.page import read_study, write_report
 from lerobot_constructskill.analysis.report.summarize import summarize
 from lerobot_constructskill.analysis.stats.comparisons import Conclusion
 from lerobot_constructskill.analysis.stats.power import detectable_spread_ratio
 from lerobot_constructskill.errors import InputError, MissingError
-from lerobot_constructskill.scripts.report import ReportConfig, report
 from lerobot_constructskill.study.rows import Draws
 
 REPOSITORY = Path(__file__).parents[2]
@@ -244,7 +243,7 @@ def test_a_label_an_order_and_alpha_change_the_page_and_no_number(tmp_path, no_f
     def page(**analysis) -> list[str]:
         write_study(root, **analysis)
         (root / "rows.parquet").write_bytes(rows)
-        report(ReportConfig(root))
+        write_report(root)
         return (root / "report.html").read_text().split("<details>")[0].splitlines()
 
     first = page()
@@ -272,7 +271,7 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
         root = tmp_path / str(shared)
         of = drawn if shared else drawn | {"demonstrations": "own", "starts": "own", "seeds_a_draw": 2}
         write_study(root, of, rows)
-        said[shared] = report(ReportConfig(root)) and (root / "report.md").read_text()
+        said[shared] = write_report(root) and (root / "report.md").read_text()
     assert (
         "hold for other training seeds, with the same demonstrations and starts" in said[True]
         and "draws.png" not in said[True]
@@ -287,7 +286,7 @@ def test_seeds_of_a_draw_count_once_and_the_spread_is_split(tmp_path, no_figures
     assert float(mean[False][0]) < float(mean[True][0]) and float(mean[False][1]) > float(mean[True][1])
     lacks = [row for row in rows if row.training_seed < 5] + [missing_row(drawn, ("fixed", "one", 5))]
     write_study(tmp_path / "lacks", drawn | {"demonstrations": "own", "starts": "own", "seeds_a_draw": 2}, lacks)
-    report(ReportConfig(tmp_path / "lacks"))
+    write_report(tmp_path / "lacks")
     text = (tmp_path / "lacks" / "report.md").read_text()
     assert re.search(r"one \| 5\.7 \(.*\) \| 2\.5 \|", text), "(8.5 + 2.5 + 6) / 3, not (9 + 8 + 2 + 3 + 6) / 5"
     assert "1 of 6 runs are missing" in text and "3/3 (29–100 %)" in text
@@ -305,7 +304,7 @@ def test_walls_are_told_by_their_chains_and_where_these_break(tmp_path, no_figur
     for row in study_rows(SMALL):
         chain = chains[row.variant, row.training_seed][row.episode]
         rows.append(replace(row, chain=chain, placements=chain, measures=laid(chain)))
-    report(ReportConfig(write_study(tmp_path, SMALL, rows)))
+    write_report(write_study(tmp_path, SMALL, rows))
     text = (tmp_path / "report.md").read_text()
     assert "| one | 1.25 \\[1.00–1.50\\] | 1.25 | 1, 2, 0, 1 | 4.0 | 2.0 | 1.0 | 0.5 |" in text
     assert "| two | 0.00 \\[0.00–0.00\\] | 0.00 | 4, 0, 0, 0 | – | – | – | – |" in text
@@ -374,7 +373,7 @@ def test_a_mean_over_tasks_is_of_seeds_that_ran_in_all_and_pools_no_episodes(tmp
     assert 0 < found["clip"].success["placed"].chance < 0.5, "of the seeds that ran in both"
     assert not mean.drawn and not mean.walls, "a split and a wall are of one task"
     assert ("dinov2", "clip") in {(pair.a, pair.b) for pair in mean.comparisons["placed"]}
-    assert "## both" in (Path(report(ReportConfig(tmp_path))).parent / "report.md").read_text()
+    assert "## both" in (Path(write_report(tmp_path)).parent / "report.md").read_text()
 
 
 def test_in_a_sweep_variants_with_the_same_label_are_one_line(tmp_path):
@@ -416,7 +415,7 @@ def test_in_a_sweep_variants_with_the_same_label_are_one_line(tmp_path):
 )
 def test_an_analysis_that_does_not_fit_is_refused_in_a_sentence(analysis, said, tmp_path):
     with pytest.raises(InputError, match=re.escape(said)):
-        report(ReportConfig(write_study(tmp_path, SMALL, missing_rows(SMALL), **analysis)))
+        write_report(write_study(tmp_path, SMALL, missing_rows(SMALL), **analysis))
 
 
 @pytest.mark.slow
@@ -428,7 +427,7 @@ def test_report_is_the_same_twice(tmp_path):
 
 
 def files(root: Path) -> list[Path]:
-    report(ReportConfig(root))
+    write_report(root)
     return [path for path in root.rglob("*") if path.is_file()]
 
 
@@ -440,7 +439,7 @@ def test_studies_at_the_ends(met, tmp_path):
     (setting,) = findings_of(SMALL, rows, tmp_path).settings
     assert [pair.conclusion for pair in setting.comparisons["placed"]] == [Conclusion.INCONCLUSIVE]
     assert setting.correlations[0][1]["placed"] is None
-    report(ReportConfig(tmp_path))
+    write_report(tmp_path)
     assert not list((tmp_path / "figures").glob("*_error.*"))
 
 
@@ -453,14 +452,14 @@ def test_a_variant_that_could_not_run_is_never_a_zero(kind, error, tmp_path, no_
     assert one.success["placed"].counts.met == 1
     assert not two.success and two.absence == "no run finished"
     assert findings.settings[0].comparisons["placed"] == []
-    report(ReportConfig(tmp_path))
+    write_report(tmp_path)
     markdown = (tmp_path / "report.md").read_text()
     assert "| two | no run finished |" in markdown
     assert error.replace("_", "\\_") in markdown.split("## Failed runs")[1]
 
 
 def test_a_study_without_any_run_gets_a_report(tmp_path):
-    report(ReportConfig(write_study(tmp_path, SMALL, missing_rows(SMALL))))
+    write_report(write_study(tmp_path, SMALL, missing_rows(SMALL)))
     markdown = (tmp_path / "report.md").read_text()
     assert "4 of 4 runs are missing" in markdown and "| one | not run yet |" in markdown
 
@@ -468,14 +467,14 @@ def test_a_study_without_any_run_gets_a_report(tmp_path):
 def test_what_cannot_be_reported_is_refused_in_a_sentence(tmp_path):
     rows = episode_rows(SMALL, ("fixed", "one", 0), 1, 1)
     with pytest.raises(InputError, match="is in the rows twice"):
-        report(ReportConfig(write_study(tmp_path / "twice", SMALL, rows + rows[:1])))
+        write_report(write_study(tmp_path / "twice", SMALL, rows + rows[:1]))
     longer = episode_rows(SMALL | {"episodes": 5}, ("fixed", "one", 1), 1, 1)
     with pytest.raises(InputError, match="runs of 2 and of 5 episodes"):
-        report(ReportConfig(write_study(tmp_path / "mixed", SMALL, rows + longer)))
+        write_report(write_study(tmp_path / "mixed", SMALL, rows + longer))
     with pytest.raises(InputError, match="has no rows"):
-        report(ReportConfig(write_study(tmp_path / "empty", SMALL, [])))
+        write_report(write_study(tmp_path / "empty", SMALL, []))
     with pytest.raises(InputError, match="Setting 'fixed' has no variant"):
-        report(ReportConfig(write_study(tmp_path / "bare", SMALL, episode_rows(SMALL, ("fixed", "expert", 0), 2, 2))))
+        write_report(write_study(tmp_path / "bare", SMALL, episode_rows(SMALL, ("fixed", "expert", 0), 2, 2)))
 
 
 @pytest.mark.parametrize("name", ["study.yaml", "rows.parquet"])
@@ -484,10 +483,10 @@ def test_a_folder_that_is_no_studys_is_refused_in_a_sentence(name, tmp_path):
     for content in ("name: [small", "- small", "analysis: {}", ""):
         (root / name).write_text(content)
         with pytest.raises(InputError, match=f"{name}' (is not a study's file|cannot be read): "):
-            report(ReportConfig(root))
+            write_report(root)
     (root / name).unlink()
     with pytest.raises(MissingError, match=f"'{root}' is not the folder of a study: {name} is missing."):
-        report(ReportConfig(root))
+        write_report(root)
 
 
 def test_numbers_as_they_are_written():
@@ -498,8 +497,8 @@ def test_numbers_as_they_are_written():
 COMMAND = """
 import sys
 sys.argv = ["constructskill-report", "--root={root}"]
-from lerobot_constructskill.scripts.report import tell_report
-tell_report.main()
+from lerobot_constructskill.scripts.report import report
+report.main()
 print({{"torch", "lerobot", "sapien", "mani_skill"}} & set(sys.modules))
 """
 
@@ -517,4 +516,4 @@ def test_rows_of_a_setting_that_the_study_lacks_are_refused(tmp_path):
     rows = [row for run in planned(SMALL) for row in episode_rows(SMALL, run, 1, 1)]
     root = write_study(tmp_path, SMALL | {"settings": {"other": SMALL["settings"]["fixed"]}}, rows)
     with pytest.raises(InputError, match=r"has no setting 'fixed', which rows in rows\.parquet are of"):
-        report(ReportConfig(root))
+        write_report(root)

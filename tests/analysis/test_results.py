@@ -14,8 +14,8 @@ from matplotlib.image import imread
 from synthetic_study import SMALL, episode_rows, failed_row, missing_row, missing_rows, planned, write_study
 
 from lerobot_constructskill.analysis.report import figures
+from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.parsing import read_fields
-from lerobot_constructskill.scripts.report import ReportConfig, report
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/study.yaml"))
@@ -80,7 +80,7 @@ def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     """Its text and the figures in it; to draw those of errors, which are not published, would take longest."""
     monkeypatch.setattr(figures, "error_figure", lambda setting, episodes: Figure((1, 1)))
     copy = shutil.copytree(folder, tmp_path / folder.name, ignore=lambda *_: ("figures", "report.md"))
-    report(ReportConfig(copy))
+    write_report(copy)
     text = (folder / "report.md").read_text()
     assert (copy / "report.md").read_text() == text
     for figure in re.findall(r"\]\((figures/.+)\)", text):

@@ -19,7 +19,7 @@ from lerobot_constructskill.demos.columns import SIDECAR
 from lerobot_constructskill.errors import InputError, MissingError, UserError
 from lerobot_constructskill.files import bounded_memory
 from lerobot_constructskill.scripts.dataset import CardConfig, CheckConfig, check_dataset, write_card
-from lerobot_constructskill.scripts.push_policy import render_card, seed_outcomes
+from lerobot_constructskill.scripts.push_policy import card_of, seed_outcomes
 
 pytestmark = pytest.mark.slow
 
@@ -96,8 +96,9 @@ def test_a_hostile_set_gets_no_card(pristine: Path, change) -> None:
 def test_a_policys_card_escapes_what_its_files_say(tmp_path: Path) -> None:
     hostile = "x`\n# Heading <script>[a](javascript:b)"
     train = {"seed": 0, "dataset": {"repo_id": hostile, "revision": hostile}}
-    policy = {"backbone": hostile, "type": hostile}
-    card = render_card("me/mine", [(0, 1, 1, 1)], "brick_to_bin", train, policy, {"source": hostile})
+    (tmp_path / "config.json").write_text(json.dumps({"backbone": hostile, "type": hostile}))
+    (tmp_path / "encoder.json").write_text(json.dumps({"source": hostile}))
+    card = card_of(tmp_path, "me/mine", [(0, 1, 1, 1)], "brick_to_bin", train)
     assert "<script>" not in card and "](" not in card and "\n# Heading" not in card
 
 
