@@ -38,7 +38,7 @@ class OpenLoop(ReplayAgent):
     def __init__(self, task: Task):
         NoOpAgent.__init__(self, task)
         env = ConstructSkillEnv(task.name, render_backend="none")
-        self.actions = list(act(env, ExpertAgent(task), DEMO_SEED_START))
+        self.actions = np.array(act(env, ExpertAgent(task), DEMO_SEED_START))
         env.close()
 
 

@@ -243,9 +243,13 @@ def _linked(link: re.Match[str], arms: Callable[[str, str], Arm | None]) -> str:
     arm = arms(link["file"], link["arm"])
     if link["word"] is None:
         return link[0]
-    is_there = arm is not None and not arm.runs.empty
-    text = WORDS[link["word"]](arm) if is_there else "0" if link["word"] == "draws" else NOT_YET
-    return link[0].replace(f"[{link['text']}]", f"[{text}]", 1)
+    return link[0].replace(f"[{link['text']}]", f"[{_word(arm, link['word'])}]", 1)
+
+
+def _word(arm: Arm | None, word: str) -> str:
+    if arm is None or arm.runs.empty:
+        return "0" if word == "draws" else NOT_YET
+    return WORDS[word](arm)
 
 
 def _over(runs: pd.DataFrame, settings: int) -> pd.DataFrame:

@@ -78,7 +78,7 @@ ARROWS = {
     "board.verification": ("artifacts", "envs.recording"),
     "board.copies": ("contract", "envs.actions", "envs.recording"),
     "board.recipe": ("contract", "presets", "study.rows"),
-    "board.explained": ("analysis.report.formats", "analysis.stats", "contract", "perturbations"),
+    "board.explained": ("analysis.stats", "contract", "perturbations"),
     "board.retrain": ("artifacts", "contract", "envs.recording", "parsing", "study"),
     "board.from_recordings": ("envs.recording", "study.rows"),
     "board.replay": ("artifacts", "envs"),

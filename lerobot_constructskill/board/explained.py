@@ -5,7 +5,6 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from lerobot_constructskill.analysis.report.formats import percent
 from lerobot_constructskill.analysis.stats.intervals import Estimate
 from lerobot_constructskill.board.entries import Laid
 from lerobot_constructskill.board.protocol import BoardSetting
@@ -68,9 +67,9 @@ def drawn(estimate: Estimate, has_interval: bool) -> Markup:
     )
 
 
-def laid(of: Laid) -> str:
-    """What was laid of a plan, in a line."""
-    low, high = of.chain.low, of.chain.high
+def laid(of: Laid, has_range: bool) -> str:
+    """What was laid of a plan, in a line, with the range over seeds where there are several."""
+    seeds = f" ({of.chain.low:.2f} to {of.chain.high:.2f})" if has_range else ""
     counts = [f"{count} {name}" for name in ("drops", "knocks", "collisions") if (count := getattr(of, name))]
-    told = f"chain {of.chain.value:.2f} of {of.elements} ({low:.2f} to {high:.2f}), {percent(of.share.value)} in place"
+    told = f"chain {of.chain.value:.2f} of {of.elements}{seeds}, {100 * of.share.value:.3g} % in place"
     return ", ".join([told, *counts])

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lerobot_constructskill.board import explained
 from lerobot_constructskill.board.entries import read_entries
 from lerobot_constructskill.board.exports import TABLE
 from lerobot_constructskill.board.protocol import BOARD_SUITES, BoardSetting
@@ -67,7 +68,8 @@ def test_the_chain_is_a_mean_over_seeds_and_stands_on_the_page(board, tmp_path):
     assert (laid.elements, laid.chain, laid.drops, laid.knocks, laid.collisions) == (3, (1.5, 1.5, 1.5), 2, 0, 2)
     assert laid.share == pytest.approx((7 / 12, 1 / 2, 2 / 3))
     pages = {path.stem: path.read_text() for path in write_board(board, tmp_path / "out")}
-    assert pages["wall"].count("chain 1.50 of 3 (1.50 to 1.50), 58 % in place, 2 drops, 2 collisions") == 1
+    assert pages["wall"].count("chain 1.50 of 3 (1.50 to 1.50), 58.3 % in place, 2 drops, 2 collisions") == 1
+    assert explained.laid(laid, False).startswith("chain 1.50 of 3, "), "of one seed there is no range"
     assert "<dt>Chain</dt>" in pages["wall"] and "<dt>Chain</dt>" not in pages["bins"]
     table = read_parquet(tmp_path / "out" / TABLE, most=1 << 20).to_pylist()
     assert [row["chain"] for row in table if row["entry"] == "told"] == [1, 2, 0, 3]
