@@ -226,9 +226,9 @@ def _study(folder: Path) -> tuple[Path, pd.DataFrame, Draws, dict[str, list[str]
 
 
 def _is_planned(folder: Path, rows: pd.DataFrame, name: str) -> bool:
-    """Whether no run of a setting of a study has been made, or its draws have no rows."""
+    """Whether a study has a setting of which it has no rows yet."""
     setting = name.split("/")[0]
-    return setting in read_environments(folder) and setting not in {*rows["setting"]}
+    return setting not in {*rows["setting"]} and setting in read_environments(folder)
 
 
 def _numbers(arm: Arm | None, heads: list[str]) -> Iterator[str]:

@@ -34,7 +34,7 @@ class Fork[State]:
         """
         try:
             self._pipe.send(work)
-        except BrokenPipeError:
+        except ConnectionError:
             raise MachineError(DIED) from None
         return _received(self._pipe)
 
@@ -71,7 +71,7 @@ def _received(pipe) -> Any:
     try:
         if pipe.poll(LONGEST_S):
             return pipe.recv()
-    except EOFError:
+    except (EOFError, ConnectionError):  # the latter of what died before it read what it was asked
         pass
     raise MachineError(DIED)
 

@@ -170,7 +170,7 @@ class Followed:
         tried = {self.steps: self._walk.take_over()}
         for within in criteria:
             low, high = _gap(tried, within)
-            for step in sorted((step for step in self._kept if low < step < high), reverse=True):
+            for step in [step for step in reversed(self._kept) if low < step < high]:
                 tried[step] = self._kept[step].ask(Walk.take_over)
                 if within.holds(step, tried[step]):
                     break

@@ -377,7 +377,9 @@ def test_the_spread_is_split_as_an_analysis_of_variance_splits_it(deviations, rn
         (squares["starts"] - squares["rest"]) / seeds / starts,
         squares["rest"] / starts,
     )
-    for estimate, variance in zip(split(episodes), variances, strict=True):
+    found = split(episodes)
+    assert found.episodes[1:] == pytest.approx(np.sqrt(intervals(met)["episodes"]))
+    for estimate, variance in zip(found, variances, strict=True):
         assert estimate.value == pytest.approx(np.sqrt(max(variance, 0)), abs=0.0005)
         assert estimate.low <= estimate.value <= estimate.high
 
@@ -406,6 +408,12 @@ def test_an_interval_over_draws_that_vary_most_is_that_of_a_variance_of_so_many_
     deviation = met.mean((1, 2)).std(ddof=1)
     assert np.sqrt(ten) / deviation == pytest.approx([0.69, 1.83], abs=0.04)  # chi-squared, 9 degrees of freedom
     assert two[1] > 0.5**2, "which a report calls not determined"
+
+
+def test_draws_that_are_alike_have_an_interval_without_width():
+    met = np.array([[0, 1, 1], [1, 1, 0]], float)
+    found = intervals([met, met])
+    assert all(np.isfinite(ends).all() for ends in found.values()) and np.ptp(found["episodes"]) == 0
 
 
 def test_what_cannot_be_told_apart_is_not(rng):

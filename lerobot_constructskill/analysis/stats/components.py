@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2, sem, t
+from scipy.stats import chi2, t
 from statsmodels.regression.mixed_linear_model import MixedLM, MixedLMResults
 from statsmodels.tools.sm_exceptions import ConvergenceWarning, SingularMatrixWarning
 
@@ -93,10 +93,12 @@ def intervals(draws: Sequence[np.ndarray]) -> dict[str, tuple[float, float]]:
     """The 95 % interval of each component's variance, whose ends may be below 0.
 
     Args:
-        draws: how the episodes of each ended, as `_matrix` says; two at least have two rows.
+        draws: how the episodes of each ended, 0 or 1: a row for each training seed, a column for each start. Two of
+            them, at least, have two rows.
     """
     of_each = pd.DataFrame([_mean_squares(met) for met in draws if len(met) > 1])
-    found = {name: t.interval(0.95, len(of_each) - 1, loc=own.mean(), scale=sem(own)) for name, own in of_each.items()}
+    half = t.ppf(0.975, len(of_each) - 1) * of_each.sem()
+    found = {name: (own.mean() - half[name], own.mean() + half[name]) for name, own in of_each.items()}
     means = of_each.mean().clip(lower=0)
     within = np.mean([means["starts"] + (means["seeds"] + means["episodes"]) / len(met) for met in draws])
     freedom = len(draws) - 1
