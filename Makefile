@@ -68,6 +68,7 @@ docs: setup ## the documentation as a site, without addresses of other hosts: ou
 
 release: ## wheel, source distribution, site, and what goes to the Hub under HUB=NAME (DRAFT=1 while results are missing)
 	@test '$(HUB)' || { echo "Name the user or organisation on the Hub: make release HUB=NAME" >&2; exit 2; }
+	.venv/bin/constructskill-board --root=board --films=true
 	@$(MAKE) --no-print-directory dist docs
 	.venv/bin/python results/release.py --user=$(HUB) $(if $(DRAFT),--draft)
 

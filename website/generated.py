@@ -16,6 +16,7 @@ import griffe
 from lerobot_constructskill.analysis.report.page import read_study
 from lerobot_constructskill.analysis.stats.outcomes import count, runs_of
 from lerobot_constructskill.board.exports import TABLE
+from lerobot_constructskill.board.films import FILMS
 from lerobot_constructskill.board.protocol import BOARD_SUITES
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.contract import FPS, SHIPPED, Task
@@ -126,11 +127,14 @@ def help_of(name: str, target: str) -> str:
 
 
 def board(root: Path) -> dict[str, str | bytes]:
-    """The pages and the table that `constructskill-board` makes, and a page that leads to them."""
+    """The pages, the table and those films that `constructskill-board` made, and a page that leads to them."""
     with TemporaryDirectory() as folder:
-        pages = write_board(root / "board", Path(folder), documentation="../docs/leaderboard.html")
-        made = [*pages, Path(folder) / TABLE]
-        files: dict[str, str | bytes] = {f"board/{path.name}": path.read_bytes() for path in made}
+        out = Path(folder)
+        (out / FILMS).symlink_to(root / "outputs" / "board" / FILMS)
+        pages = write_board(root / "board", out, documentation="../docs/leaderboard.html")
+        films = {out / path for page in pages for path in re.findall(rf'href="({FILMS}/[^"]+)"', page.read_text())}
+        made = [*pages, out / TABLE, *sorted(films)]
+        files: dict[str, str | bytes] = {f"board/{path.relative_to(out)}": path.read_bytes() for path in made}
     suites = "\n".join(
         f"- [`{name}`](../board/{name}.html): {', '.join(BOARD_SUITES[name].settings)}" for name in BOARD_SUITES
     )

@@ -14,7 +14,7 @@ class BoardConfig(Checked):
 
     root: Path  # the board's folder, with entries/ and verified/
     out: Path = Path("outputs/board")  # folder to write
-    films: bool = False  # also film an episode of each entry's setting that placed and one that did not
+    films: bool = False  # also film, in each entry's setting, an episode that placed and one of each cause of failure
     documentation: Text | None = None  # address of docs/leaderboard.md as a page, to which the pages lead back
     dataset_id: RepoId | None = None  # the benchmark's repository on the Hub; if given, also write .eval_results
 

@@ -21,6 +21,7 @@ from lerobot_constructskill.board.entries import ranks, read_entries
 from lerobot_constructskill.board.explained import meaning
 from lerobot_constructskill.board.exports import eval_info, write_exports, write_table
 from lerobot_constructskill.board.protocol import BOARD_SUITES, HORIZON, STANDARD, BoardSetting
+from lerobot_constructskill.board.recovered import Lost, Recovery
 from lerobot_constructskill.board.site import write_board
 from lerobot_constructskill.board.submission import Claim, read_submission, write_submission
 from lerobot_constructskill.contract import SUITES
@@ -313,12 +314,27 @@ def test_a_film_of_a_long_episode_ends_where_the_protocols_do(tmp_path, monkeypa
         def step(self, action):
             return None, 0.0, False, False, {}
 
-    lengths = []
+    filmed = []
     monkeypatch.setattr(films, "open_simulator", lambda *_: Still())
-    monkeypatch.setattr(films, "write_video", lambda path, frames, fps: lengths.append(len(frames)) or path.touch())
-    claim = Claim(0, task="brick_to_bin", steps=2 * HORIZON, actions=[np.zeros(8 * HORIZON, np.float32)])
-    films._film(claim, tmp_path / "film.mp4")
-    assert lengths == [HORIZON + 1] and (tmp_path / "film.mp4").exists()
+    monkeypatch.setattr(films, "write_video", lambda path, frames, fps: filmed.append(frames) or path.touch())
+    steps = 2 * HORIZON
+    claim = Claim(0, task="brick_to_bin", steps=steps, actions=[np.zeros(4 * steps, np.float32)])
+    for last, red in ((None, HORIZON + 1), (9, HORIZON - 9), (steps, 0)):
+        recovery = Recovery("bin", 0, 0, steps, Lost.DROPPED, False, last_step_extra=last)
+        films._film(films.Film("", claim, recovery), tmp_path / "film.mp4")
+        assert len(filmed[-1]) == HORIZON + 1 and (tmp_path / "film.mp4").exists()
+        assert [one.any() for one in filmed[-1]] == [False] * (HORIZON + 1 - red) + [True] * red
+
+
+def test_each_cause_of_failure_is_filmed_once(committed):
+    for entry in committed:
+        for setting, one in entry.standings.items():
+            shown = [*films._films(entry, setting)]
+            causes = {film.shows.partition(", lost")[0] for film in shown}
+            assert len(causes) == len(shown) == len({film.path for film in shown})
+            assert {film.claim.placed for film in shown} == {
+                claim.placed for own in one.claims.values() for claim in own
+            }
 
 
 def test_rewards_are_those_of_the_environment(committed):
