@@ -5,26 +5,12 @@ import os
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 BIN = Path(sys.executable).parent
 OUT = Path(os.environ.get("BENCH_OUT", "outputs/bench"))
 LOG = OUT / "last_command.log"
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One line of the table; the ratio is how many times better ours is."""
-
-    what: str
-    ours: float
-    baseline_name: str
-    baseline: float
-    ratio: float
-    target: float | None
-    note: str = ""
 
 
 class Timer:
@@ -56,9 +42,10 @@ def report(
     note: str = "",
     less_is_better: bool = False,
 ) -> None:
-    """Print a measurement for `run.py` to collect."""
+    """Print a line of the table for `run.py` to collect; its ratio is how many times better ours is."""
+    measured = {"what": what, "ours": ours, "baseline_name": baseline_name, "baseline": baseline}
     ratio = baseline / ours if less_is_better else ours / baseline
-    print(json.dumps(asdict(Measurement(what, ours, baseline_name, baseline, ratio, target, note))), flush=True)
+    print(json.dumps(measured | {"ratio": ratio, "target": target, "note": note}), flush=True)
 
 
 class Ran(NamedTuple):

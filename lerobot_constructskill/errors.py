@@ -99,6 +99,11 @@ def kind_of(error: BaseException) -> str:
     return "machine" if isinstance(error, OSError) else "fault"
 
 
+def one_line(said: object) -> str:
+    """A text or an exception's, whatever lines it has, as one line."""
+    return " ".join(str(said).split())
+
+
 def full_traceback(error: BaseException) -> str:
     """Every traceback of a chain of exceptions, also those that `raise ... from None` keeps from the reader."""
     whole = link = TracebackException.from_exception(error)
@@ -142,6 +147,6 @@ def print_user_errors_of_lerobot() -> None:
         if not (isinstance(first, UserError) and name.startswith("lerobot-")):
             return others(kind, error, trace)
         log = keep_traceback(sys.argv, full_traceback(error))
-        print(f"{name}: {' '.join(str(first).split())} (traceback: {log})", file=sys.stderr)
+        print(f"{name}: {one_line(first)} (traceback: {log})", file=sys.stderr)
 
     sys.excepthook = tell

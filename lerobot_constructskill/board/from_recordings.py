@@ -12,7 +12,7 @@ from lerobot_constructskill.board.recipe import recipe_of, trained_by
 from lerobot_constructskill.board.submission import Claim, Submission, write_submission
 from lerobot_constructskill.bounds import seed_of
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
-from lerobot_constructskill.errors import InputError, MissingError
+from lerobot_constructskill.errors import InputError, MissingError, one_line
 from lerobot_constructskill.study.rows import NOT_RUN, ROWS, check_folder, read_draws, read_environments, read_rows
 
 type Recorded = dict[int, list[Episode]]
@@ -69,7 +69,7 @@ def recorded_by_study(
         if row.error_kind == NOT_RUN:
             raise MissingError(f"The study has not run {row.setting}/{variant}/seed_{row.training_seed} yet.")
         if row.error_kind:
-            failures[int(row.training_seed)] = " ".join(row.error.split())[:300]
+            failures[int(row.training_seed)] = one_line(row.error)[:300]
         elif not path.is_file():
             raise MissingError(
                 f"'{path}' is missing: give the store in which the run was made; runs from before actions were kept "

@@ -8,7 +8,7 @@ from typing import Any
 from lerobot_constructskill.comparison.sides import Side, Source, conditions, recorded_side
 from lerobot_constructskill.contract import label_of
 from lerobot_constructskill.envs.recording import write_recordings
-from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.errors import InputError, one_line, plural
 from lerobot_constructskill.rollout.agents import PolicyAgent
 from lerobot_constructskill.rollout.lockstep import roll_out
 from lerobot_constructskill.training.checkpoints import check_inputs
@@ -50,7 +50,7 @@ def evaluate(
         rollouts = dict(roll_out(agents, env, [starts] * len(agents)))
         for number, checkpoint in enumerate(group):
             if (error := rollouts[number].error) is not None:
-                said = " ".join(f"{type(error).__name__}: {error}".split())
+                said = one_line(f"{type(error).__name__}: {error}")
                 raise InputError(f"The checkpoint '{checkpoint}' failed in its evaluation ({said}).") from error
             recordings = by_folder[checkpoint] = rollouts[number].recordings(facts)
             if kept_in is not None:

@@ -18,12 +18,12 @@ from lerobot_constructskill.errors import InputError, MissingError, plural
 from lerobot_constructskill.lerobot_internals import LAST_CHECKPOINT
 from lerobot_constructskill.perturbations import Perturbation
 from lerobot_constructskill.study.rows import (
-    NOT_RUN,
     ROWS,
     STUDY,
     Draws,
     check_folder,
     merged,
+    ran,
     read_draws,
     read_environments,
     read_means,
@@ -230,7 +230,7 @@ def read_study(root: Path, arm: str) -> Side:
     if arm not in set(arms):
         known = ", ".join(dict.fromkeys(arms))
         raise InputError(f"'{root}' has no variant '{arm}'; name one as in {root}:setting/variant; it has: {known}.")
-    rows = rows[(arms == arm) & (rows["error_kind"].fillna("") != NOT_RUN)]
+    rows = ran(rows[arms == arm])
     if rows.empty:
         raise InputError(f"No run of '{arm}' in '{root}' has been made.")
     setting, envs = arm.partition("/")[0], read_environments(root)
@@ -288,8 +288,8 @@ def settings_of(source: Source) -> dict[str, Place]:
         known = ", ".join(rows["variant"].unique())
         raise InputError(f"'{root}' has no variant '{source.variant}'; it has: {known}.")
     named = envs if source.setting == EVERY else read_means(root)[source.setting]
-    ran = own.loc[own["error_kind"].fillna("") != NOT_RUN, "setting"].unique()
-    places = {name: place_of(envs[name]) for name in named if name in ran}
+    there = ran(own)["setting"].unique()
+    places = {name: place_of(envs[name]) for name in named if name in there}
     if source.setting != EVERY:
         return places
     found = {name: place for name, place in places.items() if not place.perturbation}

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_constructskill.errors import InputError, MissingError, plural, remedy_of
+from lerobot_constructskill.errors import InputError, MissingError, one_line, plural, remedy_of
 from lerobot_constructskill.plans.plan import KINDS, PLAN, Plan, written
 
 logger = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ def _boxes(path: Path) -> Iterator[tuple[str, str, np.ndarray, np.ndarray]]:
         model = read_ifc(str(path))
         parts: Any = model.by_type("IfcElement")
     except (RuntimeError, OSError, AttributeError, ifcopenshell.Error) as error:
-        raise InputError(f"'{path}' is not an IFC file ({' '.join(str(error).split())[:100]}).") from None
+        raise InputError(f"'{path}' is not an IFC file ({one_line(error)[:100]}).") from None
     settings = ifcopenshell.geom.settings()
     taken: set[str] = set()
     left_out: list[str] = []

@@ -15,7 +15,7 @@ from lerobot.policies import PreTrainedPolicy, get_policy_class, make_pre_post_p
 from lerobot.utils import ACTION
 
 from lerobot_constructskill.contract import ANY_ACTION, CAMERAS, FULL_ACTION, TASK_ACTION
-from lerobot_constructskill.errors import InputError, UserError
+from lerobot_constructskill.errors import InputError, UserError, one_line
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.policy_types import read_policy
 from lerobot_constructskill.threads import one_thread
@@ -106,7 +106,7 @@ class PolicyAgent:
         except (UserError, OSError, ImportError):
             raise
         except Exception as error:  # whatever a file can do to LeRobot, safetensors and a policy of anybody's
-            said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+            said = f"{type(error).__name__}: {one_line(error)[:300]}"
             raise InputError(f"The checkpoint '{checkpoint}' cannot be loaded ({said}).") from error
         return cls(policy, *processors)
 

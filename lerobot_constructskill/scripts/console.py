@@ -17,6 +17,7 @@ from lerobot_constructskill.errors import (
     UserError,
     full_traceback,
     keep_traceback,
+    one_line,
     remedy_of,
 )
 from lerobot_constructskill.presets import find
@@ -169,7 +170,7 @@ def _report(error: BaseException, command: list[str], debug: bool) -> int:
 
 
 def _status_and_sentence(error: BaseException) -> tuple[int, str]:
-    said = " ".join(str(error).split())
+    said = one_line(error)
     said = said if len(said) <= LONGEST else f"{said[:LONGEST]}..."
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, "interrupted"

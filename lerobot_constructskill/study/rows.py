@@ -281,6 +281,11 @@ def read_rows(path: Path, kind: type[EpisodeRow] = Row) -> pd.DataFrame:
     return rows
 
 
+def ran(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those rows whose runs were made, also if they failed."""
+    return rows[rows["error_kind"].fillna("") != NOT_RUN]
+
+
 def load_rows[Kind: EpisodeRow](path: Path, kind: type[Kind] = Row) -> list[Kind]:
     """Read the same as objects. Raises as `read_rows` does."""
     return [kind(**row) for row in TABLES[kind].read(path).to_pylist()]

@@ -27,14 +27,14 @@ class Correlation(NamedTuple):
 
 
 def kendall(
-    error: np.ndarray, success: np.ndarray, variant: np.ndarray, rng: np.random.Generator, level: float = 0.95
+    error: np.ndarray, success: np.ndarray, variant: np.ndarray, rng: np.random.Generator
 ) -> Correlation | None:
     """Kendall's tau-b of held-out error and success over the pairs of runs of one variant.
 
     -1 means the lower the error the more success, as a useful offline error would show. Pairs of runs of different
     variants are left out, because differences between variants do not show that the error ranks the seeds of one.
     The p-value comes from permuting success within each variant, which keeps its level however few runs succeed. The
-    interval comes from resampling runs within each variant, and is too short where few succeed: decide by the p-value.
+    95 % interval comes from resampling runs within each variant. It is too short where few succeed: decide by p.
     Closed forms ignore the many ties that success in all or no episodes makes, and `scipy.stats.kendalltau` includes
     pairs of different variants.
 
@@ -43,7 +43,6 @@ def kendall(
         success: share of its episodes that met the criterion, (runs,).
         variant: name of the variant of each run, (runs,).
         rng: source of the resamples.
-        level: level of the interval.
 
     Returns:
         None if fewer than `FEWEST` runs are left, or in no variant both error and success differ.
@@ -57,7 +56,7 @@ def kendall(
         return None
     resampled = _draws(lambda n: rng.integers(n, size=n), groups)
     resampled = np.concatenate([_tau_b(error[rows], success[rows], groups) for rows in resampled])
-    low, high = np.nanquantile(resampled, [(1 - level) / 2, (1 + level) / 2])
+    low, high = np.nanquantile(resampled, [0.025, 0.975])
     permuted = np.concatenate([_tau_b(error, success[rows], groups) for rows in _draws(rng.permutation, groups)])
     as_large = np.sum(np.abs(permuted) >= abs(tau) - 1e-12)
     interval = Estimate(tau, min(float(low), tau), max(float(high), tau))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lerobot_constructskill.study.rows import NOT_RUN
+from lerobot_constructskill.study.rows import ran
 
 CRITERIA = ("lifted", "placed")
 """The two success metrics of an episode, each a column of the rows."""
@@ -41,8 +41,7 @@ def runs_of(rows: pd.DataFrame) -> pd.DataFrame:
         `lifted_rate` and `placed_rate`, their share in [0, 1], 0 where the run failed; `heldout_mse_m2`;
         `heldout_mse_m2_by_data`, as in the rows; `error_kind` and `error` of a failed run, else null.
     """
-    made = rows[rows["error_kind"].fillna("") != NOT_RUN]
-    groups = made.groupby(RUN, sort=True)
+    groups = ran(rows).groupby(RUN, sort=True)
     runs = pd.DataFrame({"episodes": groups["placed"].count()})
     for criterion in CRITERIA:
         runs[criterion] = groups[criterion].sum().astype(int)
@@ -101,7 +100,7 @@ def chance_of(episodes: pd.DataFrame, criterion: str) -> float | None:
     Returns:
         None too where a seed failed, or has a start twice.
     """
-    made = episodes[episodes["error_kind"].fillna("") != NOT_RUN]
+    made = ran(episodes)
     if made["error_kind"].notna().any() or made.duplicated(["setting", "training_seed", "evaluation_seed"]).any():
         return None
     return spread_by_chance(

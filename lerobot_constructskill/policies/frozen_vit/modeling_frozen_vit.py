@@ -15,7 +15,7 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.utils import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_constructskill.errors import InputError, MissingError, first_line
+from lerobot_constructskill.errors import InputError, MissingError, first_line, one_line
 from lerobot_constructskill.files import Json
 from lerobot_constructskill.threads import one_thread
 
@@ -182,9 +182,8 @@ class FrozenViTChunkPolicy(PreTrainedPolicy):
         try:
             model.load_state_dict(state, strict=True)
         except RuntimeError as error:
-            reason = " ".join(str(error).split())
             raise InputError(
-                f"The checkpoint '{model_file}' does not fit its configuration ({reason[:300]}): use the "
+                f"The checkpoint '{model_file}' does not fit its configuration ({one_line(error)[:300]}): use the "
                 "config.json it was saved with, or train again."
             ) from None
         model._check_inputs(Path(model_file).with_name("config.json"))
