@@ -68,7 +68,7 @@ class TrainedAgain:
     def _compared(self) -> str:
         if not self.others:
             return "Trained again, all weights and episodes are the same to the last bit."
-        why = "; ".join(f"{name} {there:.60} there, {here} here" for name, (there, here) in self.others.items())
+        why = "; ".join(f"{name} {there:.200} there, {here} here" for name, (there, here) in self.others.items())
         return f"Trained again with other things ({why}), so compared by seeds: {describe(self.rates, AGAIN)}."
 
 

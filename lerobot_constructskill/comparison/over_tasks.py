@@ -21,6 +21,7 @@ from lerobot_constructskill.comparison.sides import (
 )
 from lerobot_constructskill.contract import ANY_ACTION, select_tasks
 from lerobot_constructskill.errors import InputError
+from lerobot_constructskill.perturbations import Perturbation
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class OverTasks:
         names: what the user called the sides.
         tasks: setting of a study, or else task, to the sides there; each has the same training seeds in all of them.
         only_a, only_b: settings or tasks that the other side does not have or name.
+        perturbed: perturbed tasks of both, which are left out of a mean with others.
         rates_a, rates_b: share of the episodes that placed, the mean over tasks, of each training seed.
         chance_a, chance_b: as in `MatchedSides`, of these means.
         judgement: the statistics of these means.
@@ -40,6 +42,7 @@ class OverTasks:
     tasks: dict[str, MatchedSides]
     only_a: list[str]
     only_b: list[str]
+    perturbed: list[str]
     rates_a: list[float]
     rates_b: list[float]
     chance_a: float | None
@@ -62,12 +65,20 @@ def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alp
     of_a, of_b = (_places(one, wanted, asked) for one in (a, b))
     is_several = {one: is_of_several(one) for one in (a, b)}
     if not any(is_several.values()) and all(len(places or ()) < 2 for places in (of_a, of_b)):
+        a, b = (
+            _in(*next(iter(places.items())), one) if one.kind == RECORDED and places else one
+            for one, places in ((a, of_a), (b, of_b))
+        )
         return match(a, b, asked, evaluate, alpha)
     for one, other in ((a, b), (b, a)):
         if one.kind == IN_STUDY and not is_several[one]:
             several = f"--task={asked.env['task']}" if len(wanted) > 1 else f"'{other.name}'"
             raise InputError(f"{several} is of several tasks: name '{one.name}' as STUDY:*/VARIANT too.")
     shared, only_a, only_b = _shared(a, b, of_a, of_b)
+    perturbed = sorted(name for name, place in shared.items() if place.perturbation)
+    if IN_STUDY in (a.kind, b.kind) or len(perturbed) == len(shared):  # what a study means, or all there is
+        perturbed = []
+    shared = {name: place for name, place in shared.items() if name not in perturbed}
     prepared = {}
     for name, place in shared.items():
         there = replace(asked, env={**asked.env, "task": place.task}) if wanted else asked
@@ -82,6 +93,7 @@ def match_over_tasks(a: Source, b: Source, asked: Asked, evaluate: Evaluate, alp
         tasks,
         only_a,
         only_b,
+        perturbed,
         [*rates_a],
         [*rates_b],
         chance([one.a for one in matched], [one.starts for one in matched]),
@@ -107,6 +119,9 @@ def _places(source: Source, wanted: Sequence[str], asked: Asked) -> dict[str, Pl
     else:
         of_all = {place_of(vars(one)) for episodes in read_recorded(source).values() for one in episodes}
         found = {str(place): place for place in sorted(of_all)}
+        if "perturb" in asked.env:
+            label = Perturbation(asked.env["perturb"], asked.env.get("perturb_seed", 0)).label
+            found = {name: place for name, place in found.items() if place.perturbation == label}
     return {name: place for name, place in found.items() if place.task in (wanted or [place.task])}
 
 
@@ -126,8 +141,6 @@ def _shared(
             [name for name, place in one.items() if place not in other.values()]
             for one, other in ((of_a, of_b), (of_b, of_a))
         )
-    if IN_STUDY not in (a.kind, b.kind) and any(not place.perturbation for place in shared.values()):
-        shared = {name: place for name, place in shared.items() if not place.perturbation}
     if not shared:
         ran = " and ".join(
             f"'{one.name}' in {', '.join(own) or 'none'}" for one, own in ((a, of_a), (b, of_b)) if own is not None

@@ -45,16 +45,19 @@ def _over_tasks(over: OverTasks, alpha: float) -> str:
         f"{letter}  {name}: {side.kind}" for letter, name, side in zip("AB", over.names, (one.a, one.b), strict=True)
     ]
     lines += [f"at most {_steps(over)}, {one.conditions['obs_type']}", ""]
-    lines.append(f"{'':24}{'starts':<24}{f'A, mean of {unit}s':<22}B, mean of {unit}s")
+    starts = {name: _starts(matched) for name, matched in over.tasks.items()}
+    wide, wider = (max(24, 2 + max(map(len, texts))) for texts in (starts, starts.values()))
+    lines.append(f"{'':{wide}}{'starts':<{wider}}{f'A, mean of {unit}s':<22}B, mean of {unit}s")
     for name, matched in over.tasks.items():
-        starts = _starts(matched)
         a, b = (f"{mean.value:.1%}" for mean in (matched.judgement.mean_a, matched.judgement.mean_b))
-        lines.append(f"{name:<24}{starts:<24}{a:<22}{b}")
+        lines.append(f"{name:<{wide}}{starts[name]:<{wider}}{a:<22}{b}")
     means = over.judgement.mean_a, over.judgement.mean_b
     shares = [f"{mean.value:.1%} ({mean.low:.0%} to {mean.high:.0%})" for mean in means]
-    lines += [f"{'mean over these':<48}{shares[0]:<22}{shares[1]}", ""]
+    lines += [f"{'mean over these':<{wide + wider}}{shares[0]:<22}{shares[1]}", ""]
     for letter, names in (("A", over.only_a), ("B", over.only_b)):
         lines += [f"Left out, as {letter} alone has or names it: {', '.join(names)}."] if names else []
+    if over.perturbed:
+        lines.append(f"Left out, as perturbed: {', '.join(over.perturbed)}; --perturb compares one of these.")
     for letter, rates in (("A", over.rates_a), ("B", over.rates_b)):
         seeds = [getattr(matched, letter.lower()).seeds for matched in over.tasks.values()]
         failed = [" (failed)" if None in of_tasks else "" for of_tasks in zip(*seeds, strict=True)]

@@ -46,7 +46,7 @@ class Line:
     drove: dict[str, Any] | None
 
     def __str__(self) -> str:
-        said = [f"policy {self.policy}: trained on {plural(self.frames, 'frame')} with the expert's labels"]
+        said = [f"policy {self.policy}: from a data set of {plural(self.frames, 'frame')} with the expert's labels"]
         if self.heldout_mse_m2 is not None:
             said.append(f"held-out error {self.heldout_mse_m2:.3g} m2")
         if self.drove:

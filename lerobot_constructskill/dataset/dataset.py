@@ -54,11 +54,27 @@ Version = Annotated[
 """The version of a package, or what `artifacts/code.py` says of one whose source is hashed."""
 
 
+class OneRound(TypedDict):
+    """A round of DAgger, in one task: what is read of it, beside other fields."""
+
+    round: Count
+    seed_start: Seed
+    episodes: Count
+    placed: int
+    frames: Count
+    by_expert: int
+    discarded_seeds: list[Seed]
+    beta: float
+    policy_sha256: str | None
+    checkpoint: str
+    task: NotRequired[str]
+
+
 class Rounds(TypedDict):
     """How DAgger's rounds were made: what is read of it, beside other fields."""
 
     demonstrations: int
-    rounds: list[dict[str, Any]]
+    rounds: list[OneRound]
 
 
 class Tried(TypedDict):

@@ -156,7 +156,7 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     record how much they hold out, but not of which folder.
 
     Returns:
-        None if it is unknown: the checkpoint is on the Hub, or its training set was moved.
+        None if it is unknown: the checkpoint is on the Hub, or its training set was moved or made again.
     """
     from lerobot_constructskill.lerobot_internals import HF_LEROBOT_HOME
 
@@ -177,7 +177,10 @@ def trained_on(checkpoint: Path, dataset: "LeRobotDataset") -> set[int] | None:
     )
     if not is_it:
         return set() if (folder / INFO).is_file() else None
-    given = range(dataset.num_episodes) if told.get("episodes") is None else told["episodes"]
+    known, given = range(dataset.num_episodes), told.get("episodes")
+    given = [*known] if given is None else given
+    if not {*given} <= {*known}:
+        return None
     tasks: dict[str, list[int]] = {}
     for episode in given:
         tasks.setdefault(next(iter(dataset.meta.episodes[episode]["tasks"]), ""), []).append(episode)
@@ -272,7 +275,7 @@ def push(root: Path, repo_id: str, private: bool = False, tag: str | None = None
             check_private(**repo)
         tagged = {ref.name for ref in api.list_repo_refs(**repo).tags}
         if not update and (CODEBASE_VERSION in tagged or not _is_cut(root, **repo)):
-            raise TakenError(f"'{repo_id}' holds a data set already; --update replaces it, or name another.")
+            raise TakenError(f"'{repo_id}' holds files already; --update replaces them, or name another.")
         # `upload_folder` does not look into a folder that is a link.
         names = sorted(path.relative_to(root).as_posix() for path in files_below(root, ""))
         pushed = list(filter_repo_objects(names, allow_patterns=PUSHED))

@@ -24,8 +24,11 @@ def contact_sheet(data: DataSet, path: Path) -> None:
     episodes = _firsts(data, SHEET_EPISODES)
     spans = [data.spans()[episode] for episode in episodes]
     lines = [(camera, _starts(data, span)) for span in spans for camera in data.cameras]
-    until = max(span.stop for span in spans)
-    shown = {camera: dict(islice(pictures(data, camera), until)) for camera in data.cameras}
+    wanted = {row for _, rows in lines for row in rows if row is not None}
+    shown = {
+        camera: {row: picture for row, picture in islice(pictures(data, camera), max(wanted) + 1) if row in wanted}
+        for camera in data.cameras
+    }
     titles = [*Phase, "last frame"]
     figure = Figure(figsize=(1.6 * len(titles), 1.75 * len(lines)), layout="constrained")
     axes = figure.subplots(len(lines), len(titles), squeeze=False)

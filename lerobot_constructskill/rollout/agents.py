@@ -220,10 +220,16 @@ class Lockstep:
 
 
 def copies(agent: Agent, count: int) -> list[Agent]:
-    """Agents that act alike, each with a memory of its own; policies share their weights and processors."""
+    """Agents that act alike, each with a memory of its own; policies share their weights.
+
+    Where the policy's class has an `in_lockstep` of its own, its submodules and processors remember nothing, and are
+    shared too.
+    """
     shared = []
     if isinstance(agent, PolicyAgent):
-        shared = [*agent.policy.children(), agent.preprocessor, agent.postprocessor]
+        is_forgetful = "in_lockstep" in vars(type(agent.policy))
+        parts = [*agent.policy.children(), agent.preprocessor, agent.postprocessor]
+        shared = parts if is_forgetful else [*agent.policy.parameters()]
     return [agent, *(deepcopy(agent, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 

@@ -79,18 +79,19 @@ def study(config: StudyConfig) -> str:
 
 
 def text_of(config: StudyConfig) -> str:
-    """The study as it was read, with the tasks that it leaves to the default and the labels of its references."""
+    """The study as it was read, with the task of every setting, also of a plan, and the labels of its references."""
     import draccus
     import yaml
 
-    from lerobot_constructskill.envs.configuration_constructskill import ConstructSkillEnvConfig
     from lerobot_constructskill.rollout.references import REFERENCES
+    from lerobot_constructskill.study.plan import resolve_env
 
     labels = {name: REFERENCES[name].label for name in config.references if name in REFERENCES}
     analysis = replace(config.analysis, labels=labels | config.analysis.labels)
     text = {**draccus.encode(config.study), "analysis": draccus.encode(analysis)}
     for setting in text["settings"].values():
-        setting["env"] = {"task": ConstructSkillEnvConfig.task} | setting["env"]
+        keywords = resolve_env(setting["env"])
+        setting["env"] = {name: keywords[name] for name in ("task", *setting["env"]) if name in keywords}
     return yaml.safe_dump(text, sort_keys=False, allow_unicode=True)
 
 

@@ -1,6 +1,7 @@
 """Two sides over several tasks: the mean over tasks of every seed, never of pooled episodes."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -60,11 +61,12 @@ def study(tmp_path):
 
 @pytest.fixture
 def recorded(tmp_path):
-    """Write recordings of seeds that placed so many blocks and bricks, a folder for each; returns their pattern."""
+    """Write recordings of seeds that placed so many in each setting, a folder for each; returns their pattern."""
 
-    def write(blocks: list[int], bricks: list[int]) -> str:
-        for seed, counts in enumerate(zip(blocks, bricks, strict=True)):
-            for setting, count in zip(("blocks", "bricks"), counts, strict=True):
+    def write(blocks: list[int], bricks: list[int], **others: list[int]) -> str:
+        settings = {"blocks": blocks, "bricks": bricks, **others}
+        for seed, counts in enumerate(zip(*settings.values(), strict=True)):
+            for setting, count in zip(settings, counts, strict=True):
                 env, n = SETTINGS[setting]
                 kept = [Episode(1000 + i, placed=i < count, obs_type="pixels", **env) for i in range(n)]
                 write_recordings(kept, tmp_path / "recorded" / f"seed_{seed}" / f"{setting}.parquet")
@@ -114,6 +116,19 @@ def test_recordings_of_several_tasks_are_a_side(study, recorded, tmp_path):
     next(tmp_path.glob("recorded/seed_1/bricks.parquet")).unlink()
     with pytest.raises(InputError, match="seed_1' has no recording of brick_to_bin_shifted: every training seed"):
         compare(CompareConfig(f"{tmp_path}/recorded/seed_*", f"{root}:*/a"))
+
+
+def test_one_task_or_perturbation_is_chosen_of_recordings_of_several(study, recorded, tmp_path):
+    root = study({"a": {"bricks": [10, 9], "blocks": [4, 4]}})
+    several, others = recorded([1, 2], [5, 4], dim=[3, 4]), f"{tmp_path}/others/seed_*"
+    shutil.copytree(tmp_path / "recorded", tmp_path / "others")
+    for other in (others, f"{root}:bricks/a"):
+        told = compare(CompareConfig(several, other, task="brick_to_bin_shifted"))
+        assert "in brick_to_bin_shifted, at most" in told and "A  2 of 2             45.0%" in told
+    told = compare(CompareConfig(several, others, task="block_to_bin", perturb="light=2"))
+    assert "in block_to_bin+light=2" in told and "87.5%" in told
+    told = compare(CompareConfig(several, others))
+    assert "Left out, as perturbed: block_to_bin+light=2" in told and "each seed, %: 38 45" in told
 
 
 def test_tasks_can_be_chosen_of_those_that_the_sides_have(study):

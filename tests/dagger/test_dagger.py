@@ -25,6 +25,8 @@ from lerobot_constructskill.dagger.settings import DaggerConfig
 from lerobot_constructskill.dataset.card import card_facts, render
 from lerobot_constructskill.dataset.checks import CHECKS, complaints
 from lerobot_constructskill.dataset.dataset import open_dataset
+from lerobot_constructskill.demos.columns import SIDECAR
+from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.features.node import Features
 from lerobot_constructskill.features.trainer import FeatureTrainer
 from lerobot_constructskill.parsing import parse
@@ -94,6 +96,16 @@ def test_the_checks_see_what_is_not_as_it_is_said_to_be(made, damage):
     else:
         data.rows["action"] = [a + 0.01 * d for a, d in zip(data.rows["action"], driven, strict=True)]
     assert any(complaints(data, check) for check in CHECKS.values())
+
+
+@pytest.mark.parametrize("field", ["round", "seed_start", "discarded_seeds", "placed"])
+def test_a_record_of_a_round_that_lacks_a_field_is_one_sentence(made, field, tmp_path):
+    copy = shutil.copytree(made[0] / "dataset", tmp_path / "copy")
+    facts = json.loads((copy / SIDECAR).read_text())
+    del facts["dagger"]["rounds"][0][field]
+    (copy / SIDECAR).write_text(json.dumps(facts))
+    with pytest.raises(InputError, match=rf"constructskill\.json.*{field}"):
+        open_dataset(copy)
 
 
 @pytest.mark.nightly

@@ -11,7 +11,7 @@ from lerobot.policies.factory import make_policy_config
 
 from lerobot_constructskill.errors import InputError
 from lerobot_constructskill.policies.frozen_vit.shared_encoder import BATCH, FrameCache
-from lerobot_constructskill.rollout.agents import Lockstep, Observation, PolicyAgent
+from lerobot_constructskill.rollout.agents import Lockstep, Observation, PolicyAgent, copies
 
 SEEN = Observation({"pixels": {"base": np.zeros((1, 8, 8, 3), np.uint8)}}, {}, "put it there")
 
@@ -33,6 +33,41 @@ class Sampling(torch.nn.Module):
 
 def agent():
     return PolicyAgent(Sampling(), lambda batch: batch, lambda action: action)
+
+
+class Remembering(Sampling):
+    """A policy whose submodule and processor remember: it acts by how many steps its episode has had."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = torch.nn.Linear(2, 2)
+        self.net.steps = 0
+
+    def reset(self):
+        self.net.steps = 0
+
+    def select_action(self, batch):
+        self.net.steps += 1
+        return torch.full((1, 4), self.net.steps + batch["seen"])
+
+
+class Counting:
+    """A processor that remembers, as LeRobot's relative actions do."""
+
+    seen = 0
+
+    def __call__(self, batch):
+        self.seen += 1
+        return {"seen": self.seen}
+
+
+def test_copies_of_a_policy_that_remembers_share_its_weights_and_no_memory():
+    agents = copies(PolicyAgent(Remembering(), Counting(), lambda action: action), 3)
+    assert len({id(one.policy.net.weight) for one in agents}) == 1
+    lockstep = Lockstep(agents)
+    for step in range(1, 4):
+        acts = lockstep.act(dict.fromkeys(range(3), SEEN))
+        assert {float(act[0]) for act in acts.values()} == {2.0 * step}
 
 
 def actions(seed, others):

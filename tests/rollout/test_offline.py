@@ -207,6 +207,7 @@ def test_features_of_another_encoder_are_not_scored(checkpoint, feature_set, tmp
         ({"eval_split": 0.125}, "1 episode of those that are held out by default, episode 3"),
         ({"episodes": [0, 1, 2, 4, 5, 6, 3, 7], "eval_split": 0.25}, None),
         ({"episodes": [0, 1, 2]}, None),
+        ({"episodes": [0, 1, 2, 8]}, None),  # of a set of that name that has been made again, with fewer
         ({"repo_id": "local/another"}, None),
     ],
     ids=str,

@@ -25,18 +25,20 @@ from lerobot_constructskill.errors import InputError, MachineError, UserError, k
 from lerobot_constructskill.plans.plan import written
 from lerobot_constructskill.policies.frozen_vit import precision
 from lerobot_constructskill.policies.frozen_vit.precision import PRECISIONS
-from lerobot_constructskill.scripts.study import StudyConfig
+from lerobot_constructskill.scripts.study import StudyConfig, text_of
 from lerobot_constructskill.scripts.study import study as study_command
 from lerobot_constructskill.study import runs as runs_module
 from lerobot_constructskill.study import session
-from lerobot_constructskill.study.plan import SEEDS_APART, list_runs
+from lerobot_constructskill.study.plan import SEEDS_APART, list_runs, resolve_env
 from lerobot_constructskill.study.rows import (
     NOT_RUN,
     PROVENANCE,
     ROWS,
+    STUDY,
     EpisodeRow,
     Row,
     load_rows,
+    read_environments,
     read_rows,
     write_rows,
 )
@@ -853,6 +855,16 @@ def test_a_recipe_that_trains_nothing_is_refused(recipe):
 def test_a_way_to_run_that_there_is_not_is_refused(how):
     with pytest.raises(InputError, match=next(iter(how))):
         Options(**how)
+
+
+@pytest.mark.parametrize("env", [{"plan": "course_of_three"}, {"task": "plan:course_of_three"}, {}], ids=str)
+def test_a_study_names_the_task_of_each_setting_whatever_its_file_says(env, tmp_path):
+    given = study(settings={"fixed": Setting("smoke", env | {"obs_type": "pixels_agent_pos", "fps": 20})})
+    fields = {name: getattr(given, name) for name in ("name", "settings", "variants", "references")}
+    (tmp_path / STUDY).write_text(text_of(StudyConfig(**fields)))
+    task = resolve_env(env)["task"]
+    assert read_environments(tmp_path) == {"fixed": {"task": task, "obs_type": "pixels_agent_pos"}}
+    assert not changed(given, study(settings={"fixed": Setting("smoke", read_environments(tmp_path)["fixed"])}))
 
 
 def test_a_cut_study_is_made_of_the_same_runs():
