@@ -61,7 +61,7 @@ class OneRound(TypedDict):
     seed_start: Seed
     episodes: Count
     placed: int
-    frames: Count
+    frames: int
     by_expert: int
     discarded_seeds: list[Seed]
     beta: float
