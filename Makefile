@@ -66,7 +66,7 @@ image: ## the image for vla-evaluation-harness, by docker, podman or buildah; BA
 docs: setup ## the documentation as a site, without addresses of other hosts: outputs/site/index.html
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict
 
-release: ## wheel, source distribution, site, and what goes to the Hub under HUB=NAME (DRAFT=1 while results are missing)
+release: setup ## wheel, source distribution, site, and what goes to the Hub under HUB=NAME (DRAFT=1 while results are missing)
 	@test '$(HUB)' || { echo "Name the user or organisation on the Hub: make release HUB=NAME" >&2; exit 2; }
 	.venv/bin/constructskill-board --root=board --films=true
 	@$(MAKE) --no-print-directory dist docs

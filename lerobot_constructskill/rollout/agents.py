@@ -111,6 +111,11 @@ class PolicyAgent:
         return cls(policy, *processors)
 
     @property
+    def is_forgetful(self) -> bool:
+        """Whether its submodules and processors remember nothing, as a class with an `in_lockstep` of its own says."""
+        return "in_lockstep" in vars(type(self.policy))
+
+    @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that are among the policy's inputs; every camera where it has other names for pictures."""
         named = {camera.key: name for name, camera in CAMERAS.items()}
@@ -220,16 +225,11 @@ class Lockstep:
 
 
 def copies(agent: Agent, count: int) -> list[Agent]:
-    """Agents that act alike, each with a memory of its own; policies share their weights.
-
-    Where the policy's class has an `in_lockstep` of its own, its submodules and processors remember nothing, and are
-    shared too.
-    """
+    """Agents that act alike, each with a memory of its own. Policies share their weights, or all that forgets."""
     shared = []
     if isinstance(agent, PolicyAgent):
-        is_forgetful = "in_lockstep" in vars(type(agent.policy))
         parts = [*agent.policy.children(), agent.preprocessor, agent.postprocessor]
-        shared = parts if is_forgetful else [*agent.policy.parameters()]
+        shared = parts if agent.is_forgetful else [*agent.policy.parameters()]
     return [agent, *(deepcopy(agent, {id(one): one for one in shared}) for _ in range(count - 1))]
 
 

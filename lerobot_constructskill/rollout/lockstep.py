@@ -138,8 +138,8 @@ def _lanes_of(
     cameras = {"cameras": tuple(name for name in offered if name in looked) or offered[:1]}
     seen = cameras | env_kwargs
     if isinstance(agent, PolicyAgent) or looked:
-        is_shared = isinstance(agent, PolicyAgent) and "in_lockstep" in vars(type(agent.policy))
-        count = ceil(min(2 * n_workers, MOST_LANES) / n_agents) if is_shared else 1
+        is_forgetful = isinstance(agent, PolicyAgent) and agent.is_forgetful
+        count = ceil(min(2 * n_workers, MOST_LANES) / n_agents) if is_forgetful else 1
         shares, rest = _shares(range(len(seeds)), count), seen
     else:
         shares = [range(1), *_shares(range(1, len(seeds)), n_workers)]

@@ -91,7 +91,8 @@ def text_of(config: StudyConfig) -> str:
     text = {**draccus.encode(config.study), "analysis": draccus.encode(analysis)}
     for setting in text["settings"].values():
         keywords = resolve_env(setting["env"])
-        setting["env"] = {name: keywords[name] for name in ("task", *setting["env"]) if name in keywords}
+        given = {name: value for name, value in setting["env"].items() if name in keywords and name != "task"}
+        setting["env"] = {"task": keywords["task"], **given}
     return yaml.safe_dump(text, sort_keys=False, allow_unicode=True)
 
 

@@ -859,11 +859,12 @@ def test_a_way_to_run_that_there_is_not_is_refused(how):
 
 @pytest.mark.parametrize("env", [{"plan": "course_of_three"}, {"task": "plan:course_of_three"}, {}], ids=str)
 def test_a_study_names_the_task_of_each_setting_whatever_its_file_says(env, tmp_path):
-    given = study(settings={"fixed": Setting("smoke", env | {"obs_type": "pixels_agent_pos", "fps": 20})})
+    kept = {"obs_type": "pixels_agent_pos", "render_backend": "auto"}
+    given = study(settings={"fixed": Setting("smoke", env | kept | {"fps": 20})})
     fields = {name: getattr(given, name) for name in ("name", "settings", "variants", "references")}
     (tmp_path / STUDY).write_text(text_of(StudyConfig(**fields)))
     task = resolve_env(env)["task"]
-    assert read_environments(tmp_path) == {"fixed": {"task": task, "obs_type": "pixels_agent_pos"}}
+    assert read_environments(tmp_path) == {"fixed": {"task": task} | kept}, "and nothing that a machine chose"
     assert not changed(given, study(settings={"fixed": Setting("smoke", read_environments(tmp_path)["fixed"])}))
 
 
