@@ -18,7 +18,7 @@ from lerobot_constructskill.contract import FPS
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.study.rows import VARIANT, read_environments, read_rows
 
-EDGES = [0, 10, 20, 30, 40, 60, 80, 110, 150]
+EDGES = [0, 10, 20, 30, 40, 60, 80, 110, 150, np.inf]
 """Millimetres."""
 
 
@@ -43,6 +43,8 @@ def place(simulator: ConstructSkillEnv) -> tuple[float, float]:
 def watch(entry: Path, setting: str, start: int) -> None:
     """Tell where the hand is in an entry's episodes from a start."""
     claims = [one for one in read_submission(entry).claims if (one.setting, one.evaluation_seed) == (setting, start)]
+    if not claims:
+        sys.exit(f"{entry} has no episode of {setting} from start {start}.")
     simulator = ConstructSkillEnv(**claims[0].environment, render_backend="none")
     for claim in claims:
         simulator.reset(seed=start)

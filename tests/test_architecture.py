@@ -95,7 +95,7 @@ ARROWS = {
     "board.site": ("analysis.report.formats", "artifacts", "contract"),
     "analysis": (),
     "analysis.stats": ("study.rows",),
-    "analysis.report": ("artifacts", "parsing", "presets", "study.rows", "study.timing"),
+    "analysis.report": ("artifacts", "parsing", "presets", "study.rows", "study.spec", "study.timing"),
     "comparison": (
         "analysis.report.formats",
         "analysis.stats",

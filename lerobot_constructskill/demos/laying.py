@@ -28,6 +28,7 @@ class LayingExpert(PreciseExpert):
 
     release_gap = 0.002
     _clear_height = 0.10
+    _pushed_in = 0.0  # a wall has no rim
 
     def _way(self, error: np.ndarray, state: PrivilegedState) -> np.ndarray:
         """Round the robot's base where the straight way leads too near it, as to an element that waits beside it."""

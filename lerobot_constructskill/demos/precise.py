@@ -58,6 +58,9 @@ class PreciseExpert(PickPlaceExpert):
     release_gap: ClassVar[float] = 0.003
     """Height in metres over the floor of the receptacle from which an object may drop."""
 
+    _pushed_in: ClassVar[float] = COARSEST
+    """Metres off the middle from which a rim pushes an object in."""
+
     def _is_over(self, state: PrivilegedState, progress: ExpertProgress) -> bool:
         is_centred = (abs(self._grasp_point(state) - state.tcp) < CENTRED).all()
         return super()._is_over(state, progress) and bool(is_centred or progress.phase is not Phase.DESCEND)
@@ -117,14 +120,17 @@ class PreciseExpert(PickPlaceExpert):
     # Advice
 
     def _is_there(self, state: PrivilegedState) -> bool:
-        is_over = _is_over_opening(state, self._carry_error(state))
+        is_over = self._is_over_opening(state, self._carry_error(state))
         return bool(state.stands and is_over and state.underside < state.floor + SEATED)
+
+    def _is_over_opening(self, state: PrivilegedState, error: np.ndarray) -> bool:
+        return bool((abs(error[:2]) < np.maximum(_play(state), self._pushed_in)).all())
 
     def _is_at_receptacle(self, state: PrivilegedState) -> bool:
         """RELEASE aligns above the opening; an object that has come down beside it rises again."""
         error = self._carry_error(state)
         if state.underside < state.rim:
-            return _is_over_opening(state, error)
+            return self._is_over_opening(state, error)
         return bool(np.linalg.norm(error[:2]) < self.config.threshold and error[2] > -self.config.threshold)
 
     def _is_off_centre(self, state: PrivilegedState) -> bool:
@@ -187,7 +193,3 @@ def _half_turn(angle: float) -> float:
 def _play(state: PrivilegedState) -> np.ndarray:
     """Room beside the object in x and y, (2,) metres; below 0 where it has a shoulder that stays outside."""
     return (state.bin_interior - state.object_size)[:2] / 2
-
-
-def _is_over_opening(state: PrivilegedState, error: np.ndarray) -> bool:
-    return bool((abs(error[:2]) < np.maximum(_play(state), COARSEST)).all())

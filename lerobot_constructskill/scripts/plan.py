@@ -5,9 +5,12 @@ from pathlib import Path
 
 from lerobot_constructskill.artifacts.folders import replaced
 from lerobot_constructskill.bounds import Checked
-from lerobot_constructskill.errors import InputError, plural
+from lerobot_constructskill.errors import InputError, TakenError, plural
 from lerobot_constructskill.plans.plan import Plan, read_plan, written
 from lerobot_constructskill.scripts.console import command
+
+MADE = "# Made of "
+"""How the file of a plan begins that was made of an IFC file."""
 
 
 @dataclass
@@ -30,7 +33,7 @@ class PlanConfig(Checked):
                 raise InputError(f"{name} must be a file that ends in {' or '.join(endings)}, not '{path}'.")
         if self.origin is not None and len(self.origin) != 2:
             raise InputError(f"origin must be two numbers, x and y in metres, not {self.origin}.")
-        if (is_ifc := self.plan.endswith(".ifc")) != (self.out is not None):
+        if (is_ifc := self.plan.lower().endswith(".ifc")) != (self.out is not None):
             raise InputError(
                 "A plan of an IFC file needs --out=PLAN.yaml, where it is written."
                 if is_ifc
@@ -45,6 +48,7 @@ def plan(config: PlanConfig) -> str:
     Raises:
         MissingError: there is no such plan, or IfcOpenShell is not installed.
         InputError: it is no plan, or cannot be built; every reason is told.
+        TakenError: there is a file at `out` that was not made of an IFC file.
     """
     from lerobot_constructskill.plans.check import complaints
 
@@ -54,9 +58,9 @@ def plan(config: PlanConfig) -> str:
 
         with replaced(config.picture) as partial:
             draw_plan(read, config.plan, partial)
-    if found := list(complaints(read)):
-        raise InputError(" ".join(found))
     made = f" It was written to {config.out}." if config.out else ""
+    if found := list(complaints(read)):
+        raise InputError(" ".join(found) + made)
     drawn = f" It is drawn in {config.picture}." if config.picture else ""
     return f"{config.plan}: {plural(len(read.elements), 'element')}, can be built by this robot.{made}{drawn}"
 
@@ -65,7 +69,9 @@ def _of_ifc(config: PlanConfig, out: Path) -> Plan:
     """Write the plan of an IFC file and read it."""
     from lerobot_constructskill.plans.ifc import plan_of
 
+    if out.exists() and not out.read_bytes().startswith(MADE.encode()):
+        raise TakenError(f"{out} exists and was not made of an IFC file: name another with --out.")
     facts = plan_of(Path(config.plan), (config.origin[0], config.origin[1]) if config.origin else None)
     with replaced(out) as partial:
-        partial.write_text(f"# Made of {Path(config.plan).name}.\n{written(facts)}", encoding="utf-8")
+        partial.write_text(f"{MADE}{Path(config.plan).name}.\n{written(facts)}", encoding="utf-8")
     return read_plan(str(out))

@@ -16,6 +16,7 @@ from synthetic_study import SMALL, episode_rows, failed_row, missing_row, missin
 from lerobot_constructskill.analysis.report import figures
 from lerobot_constructskill.analysis.report.page import write_report
 from lerobot_constructskill.parsing import read_fields
+from lerobot_constructskill.study.rows import ran, read_rows
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted(path.parent for path in (ROOT / "results").glob("*/study.yaml"))
@@ -85,6 +86,17 @@ def test_a_published_report_is_made_of_its_rows(folder, tmp_path, monkeypatch):
     assert (copy / "report.md").read_text() == text
     for figure in re.findall(r"\]\((figures/.+)\)", text):
         assert np.array_equal(imread(copy / figure), imread(folder / figure))
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_tables_command_makes_as_many_seeds_as_were_made(folder):
+    rows, text = ran(read_rows(folder / "rows.parquet")), (folder / "report.md").read_text().replace("\\", "")
+    variants = load(ROOT / "configs" / "study" / f"{folder.name}.yaml")["variants"]
+    commands = re.findall(rf"constructskill-study {folder.name} --only=(\w+)/(\w+)(?: --seeds=(\d+))?</code>", text)
+    assert len(commands) == len({setting for setting, *_ in commands}) > 0
+    for setting, variant, seeds in commands:
+        made = rows[(rows["setting"] == setting) & (rows["variant"] == variant)]["training_seed"].nunique()
+        assert int(seeds or variants[variant].get("seeds", 10)) == made or not (made or seeds)
 
 
 LONG = ("README.md", "docs/results.md", "results/language/notes.md")

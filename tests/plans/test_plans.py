@@ -272,6 +272,12 @@ def test_an_ifc_file_becomes_a_plan_that_can_be_built(tmp_path):
     made, path = tmp_path / "wall.yaml", ifc_of(tmp_path / "wall.ifc", WALL)
     told = call("constructskill-plan", str(path), f"--out={made}", "--origin=[-0.4, -0.25]")
     assert "3 elements, can be built" in told and str(made) in told
+    again = path.rename(tmp_path / "WALL.IFC")
+    assert str(made) in call("constructskill-plan", str(again), f"--out={made}", "--origin=[-0.4, -0.25]")
+    own = tmp_path / "own.yaml"
+    own.write_text("instruction: mine\n")
+    assert "was not made of an IFC file" in call("constructskill-plan", str(again), f"--out={own}", fails=True)
+    assert own.read_text() == "instruction: mine\n"
     read = read_plan(str(made))
     assert list(read.elements) == ["brick_1", "brick_2", "top"] and read.elements["top"].on == ["brick_1", "brick_2"]
     np.testing.assert_allclose(

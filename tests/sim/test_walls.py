@@ -5,7 +5,7 @@ import pytest
 
 from lerobot_constructskill.contract import DEMO_SEED_START, get_task
 from lerobot_constructskill.demos.demonstrate import demonstrate
-from lerobot_constructskill.demos.expert import ExpertConfig, PrivilegedState, make_expert
+from lerobot_constructskill.demos.expert import ExpertConfig, Phase, PrivilegedState, make_expert
 from lerobot_constructskill.demos.noise import NoiseConfig
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.errors import InputError
@@ -82,6 +82,26 @@ def test_what_is_laid_moves_what_comes_after_and_what_is_knocked_off_is_next_aga
     again, info = put(0, [-0.5, 0.0, float(off[2])])
     assert again.number == 0 and (info["chain"], info["placements"], info["knocks"]) == (0, 0, 1)
     env.close()
+
+
+def test_a_brick_that_lies_outside_a_fine_tolerance_is_taken_again(tmp_path):
+    import torch
+    from mani_skill.utils.structs import Pose
+
+    path = tmp_path / "fine.yaml"
+    path.write_text(written({"elements": {"a": {"kind": "brick", "at": [-0.34, -0.22]}}, "tolerance": 0.001}))
+    task = get_task(f"plan:{path}")
+    env, expert = ConstructSkillEnv(task.name, render_backend="none"), make_expert(task, ExpertConfig())
+    env.reset(seed=0)
+    state = PrivilegedState(**env.privileged_state())
+    lies = [state.bin_position[0] + 0.004, state.bin_position[1], state.object_size[2] / 2]
+    pose = Pose.create_from_pq(torch.tensor([lies], dtype=torch.float32), torch.tensor([[1.0, 0, 0, 0]]))
+    env._env.objects[0].set_pose(pose)
+    for _ in range(8):
+        *_, info = env.step(np.array([0, 0, 0, 1], np.float32))
+    advice = expert.advise(PrivilegedState(**env.privileged_state()))
+    env.close()
+    assert info["placements"] == 0 and advice.phase is Phase.PREGRASP and not advice.hopeless
 
 
 @pytest.mark.parametrize("elements", [SEVEN, pytest.param(NINE, marks=pytest.mark.nightly)], ids=["seven", "nine"])

@@ -29,10 +29,12 @@ from lerobot_constructskill.study.rows import (
     STUDY,
     check_folder,
     merged,
+    ran,
     read_draws,
     read_environments,
     read_rows,
 )
+from lerobot_constructskill.study.spec import Variant
 from lerobot_constructskill.study.timing import time_by_stage
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -79,6 +81,7 @@ def write_report(root: Path) -> Path:
     context = {
         "name": name,
         "is_shipped": _is_shipped(name, rows),
+        "seeds": partial(_seeds, name, rows),
         "tasks": {setting: env["task"] for setting, env in environments.items()},
         "study": read_text(root / STUDY),
         "findings": findings,
@@ -142,6 +145,13 @@ def _is_shipped(name: str, rows: pd.DataFrame) -> bool:
         *study["variants"],
         *study.get("references", {}),
     }
+
+
+def _seeds(name: str, rows: pd.DataFrame, setting: str, variant: str) -> str:
+    """The flag that makes as many seeds of a study of ours as were made, where these are fewer than its file has."""
+    made = ran(rows).query("setting == @setting and variant == @variant")["training_seed"].nunique()
+    planned = read_fields(find("study", name))["variants"][variant].get("seeds", Variant.seeds)
+    return f" --seeds={made}" if 0 < made < planned else ""
 
 
 def _is_inside(root: Path, video: str) -> bool:

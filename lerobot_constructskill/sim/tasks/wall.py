@@ -32,8 +32,8 @@ LINE_LENGTH, BESIDE_LINE = 0.9, 0.01
 class WallEnv(PickPlaceEnv):
     """
     **Task Description:**
-    Lay the elements of a plan in its order. Each goes on and beside what really lies there, so that what is laid first
-    moves what comes after.
+    Lay the elements of a plan in its order. Each goes on and beside the placed ones as they really lie, so that what
+    is laid first moves what comes after; where one is not placed, the plan's own place of it counts.
 
     **Randomizations:**
     - Every element waits within 0.03 m of its nominal place in x and y; its yaw is fixed.
@@ -41,7 +41,8 @@ class WallEnv(PickPlaceEnv):
 
     **Success Conditions:**
     - Every element is within the plan's tolerance of its place in x and y, stands on what carries it, is upright,
-      aligned and at rest, and was let go for five consecutive steps. One that is moved later has to be laid again.
+      aligned and at rest for five consecutive steps while the gripper is open. One that is moved later counts again
+      once this holds again.
 
     Args:
         plan: a name in `configs/plan` or a file.
