@@ -34,7 +34,7 @@ has_mesa() { dpkg --compare-versions "$(dpkg-query -W -f '${Version}' mesa-vulka
 install_packages() {
     local package
     for package in $(missing); do apt_install "$package" || say "apt has no $package"; done
-    has_mesa || install_backport || say "no Mesa from $MESA on: constructskill-doctor says what that means"
+    has_mesa || { apt_install mesa-vulkan-drivers && has_mesa; } || install_backport || say "no Mesa from $MESA on: constructskill-doctor says what that means"
 }
 
 # Debian 12 has a newer Mesa in its backports, which its own mirror has as well.
@@ -72,7 +72,8 @@ fill_venv() {
     [[ ! -t 2 ]] || quiet= # on a terminal uv shows how far it is
     has_python || uv venv --quiet --clear --seed --python '>=3.12,<3.14' .venv ||
         uv venv --quiet --clear --seed --python 3.12 --managed-python .venv
-    ln -sf "$(readlink -f "$(command -v uv)")" .venv/bin/uv # for whoever enters .venv and installs a plugin
+    [[ $(command -v uv) -ef .venv/bin/uv ]] ||
+        ln -sf "$(readlink -f "$(command -v uv)")" .venv/bin/uv # for whoever enters .venv and installs a plugin
     uv pip install $quiet --compile-bytecode --python .venv/bin/python -c constraints.txt -e ".[$EXTRAS]"
     uv pip install $quiet --python .venv/bin/python --no-deps $MOBILENET || say "no weights of mobilenet_v2"
 }

@@ -69,7 +69,7 @@ def remedy_of(error: ModuleNotFoundError) -> str | None:
         for requirement in requires(DISTRIBUTION) or ():
             package, extra = re.match(r"[\w.-]+", requirement)[0], re.search(r"extra == [\"']([\w-]+)", requirement)
             if extra and package.replace("-", "_") == wanted:
-                return f"{wanted} is not installed; pip install '{DISTRIBUTION}[{extra[1]}]'."
+                return f"{wanted} is not installed; uv pip install '{DISTRIBUTION}[{extra[1]}]'."
     return None
 
 

@@ -41,6 +41,12 @@ class Part:
     def holds(self, run: Run) -> bool:
         return run.arm.name == self.variant and run.arm.setting in self.settings
 
+    def shares(self, other: "Part") -> bool:
+        """Whether a run is in both."""
+        return (self.study, self.variant) == (other.study, other.variant) and bool(
+            {*self.settings} & {*other.settings}
+        )
+
     def rows(self, folder: Path) -> pd.DataFrame:
         """A row for each of its runs in a study's folder."""
         rows = read_rows(folder / ROWS).drop_duplicates(["setting", "variant", "training_seed"])
@@ -97,8 +103,10 @@ def of(study: str) -> dict[str, Part]:
 
 
 def whole(folder: Path, study: str) -> list[str]:
-    """The entries of a study that can be written."""
-    return [name for name, entry in of(study).items() if entry.is_whole(folder)]
+    """The entries of a study that can be written. Those that share runs are written together, and then these go."""
+    entries = of(study)
+    lacking = [entry for entry in entries.values() if not entry.is_whole(folder)]
+    return [name for name, entry in entries.items() if not any(map(entry.shares, lacking))]
 
 
 def write_entries(names: Sequence[str], folder: Path, study: str, board: Path, commit: str) -> list[str]:

@@ -101,7 +101,7 @@ def write(out: Path, user: str, store: Store, site: Path, machine: Machine, draf
             f"The results lack {plural(left, 'piece')}, or have them of older code: `make results` makes them. "
             "--draft writes a release without them, which cannot be uploaded."
         )
-    release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}", draft=left > 0)
+    release = _Release(user=user, tag=f"v{version('lerobot_env_constructskill')}", draft=draft)
     sets = {
         name: Demonstrations(parse_named(GenerateConfig, "generate", name, ["--repo_id=local/set"])) for name in SETS
     }
@@ -228,7 +228,8 @@ def main() -> None:
         return
     load_plugins()
     write(asked.out, asked.user, Store(asked.store.absolute()), asked.site, Machine(asked.workers), asked.draft)
-    say(f"{asked.out} holds the release: look at it, then `python results/release.py --push`")
+    then = "it cannot be uploaded" if asked.draft else "look at it, then `python results/release.py --push`"
+    say(f"{asked.out} holds the {'draft' if asked.draft else 'release'}: {then}")
 
 
 if __name__ == "__main__":

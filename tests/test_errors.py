@@ -103,8 +103,8 @@ def test_what_the_user_can_mend_is_one_sentence(command: str, tmp_path: Path) ->
     [
         (OSError(28, "No space left on device"), 1, "[Errno 28] No space left on device"),
         (ModuleNotFoundError("No module named x", name="x"), 1, "No module named x; constructskill-doctor says"),
-        (ModuleNotFoundError("No module named sapien", name="sapien"), 1, "sapien is not installed; pip install '"),
-        (ModuleNotFoundError("No module named jinja2", name="jinja2"), 1, "jinja2 is not installed; pip install '"),
+        (ModuleNotFoundError("No module named sapien", name="sapien"), 1, "sapien is not installed; uv pip install '"),
+        (ModuleNotFoundError("No module named jinja2", name="jinja2"), 1, "jinja2 is not installed; uv pip install '"),
         (KeyboardInterrupt(), 130, "interrupted"),
     ],
 )
@@ -221,7 +221,7 @@ def test_a_traceback_comes_home_from_a_simulators_process(monkeypatch) -> None:
 def test_a_missing_package_is_named_with_its_extra() -> None:
     for package, extra in ("mani_skill", "sim"), ("matplotlib", "study"), ("openvino", "cpu"), ("ray", "distributed"):
         remedy = remedy_of(ModuleNotFoundError(name=f"{package}.inner"))
-        assert remedy == f"{package} is not installed; pip install 'lerobot_env_constructskill[{extra}]'."
+        assert remedy == f"{package} is not installed; uv pip install 'lerobot_env_constructskill[{extra}]'."
     assert remedy_of(ModuleNotFoundError(name="elsewhere")) is None
 
 
@@ -235,7 +235,7 @@ ConstructSkillEnv().reset(seed=0)
 
 def test_an_environment_without_its_simulator_says_what_to_install() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_SIMULATOR], capture_output=True, text=True)
-    assert "pip install 'lerobot_env_constructskill[sim]'." in done.stderr.splitlines()[-1]
+    assert "uv pip install 'lerobot_env_constructskill[sim]'." in done.stderr.splitlines()[-1]
 
 
 def test_what_lerobot_parses_is_refused_by_no_value_error() -> None:

@@ -99,7 +99,7 @@ def _ray(workers: int) -> Iterator[Submit]:
     try:
         import ray
     except ImportError:
-        raise InputError("Ray is not installed; pip install 'lerobot_env_constructskill[distributed]'.") from None
+        raise InputError("Ray is not installed; uv pip install 'lerobot_env_constructskill[distributed]'.") from None
     here = {} if "RAY_ADDRESS" in os.environ else {"address": "local", "num_cpus": workers, "include_dashboard": False}
     ray.init(log_to_driver=False, logging_level="error", **here)
     try:

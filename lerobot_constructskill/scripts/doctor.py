@@ -110,14 +110,14 @@ print(
 )
 """
 
-REINSTALL = f"pip install --force-reinstall '{DISTRIBUTION}', or the checkout's folder in its place"
+REINSTALL = f"uv pip install --force-reinstall '{DISTRIBUTION}', or the checkout's folder in its place"
 WEIGHTS = "let this machine reach the Hub, or give a local copy with --policy.backbone_path"
 PROBES = (
     Probe("Versions", VERSIONS, REINSTALL),
     Probe(
         "Vulkan",
         RENDER,
-        f"pip install '{DISTRIBUTION}[sim]', and apt-get install mesa-vulkan-drivers libvulkan1, 24.3 or newer "
+        f"uv pip install '{DISTRIBUTION}[sim]', and apt-get install mesa-vulkan-drivers libvulkan1, 24.3 or newer "
         "(Debian 12: its backports; Ubuntu 24.04), or on an NVIDIA machine the driver's Vulkan part (in a container: "
         "NVIDIA_DRIVER_CAPABILITIES=all)",
     ),

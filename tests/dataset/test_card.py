@@ -189,5 +189,5 @@ def test_generating_writes_the_card_as_well(tmp_path, monkeypatch, capsys):
     assert "# local/toy" in (tmp_path / "one" / "README.md").read_text()
     monkeypatch.setitem(sys.modules, "jinja2", None)
     generate(GenerateConfig("local/toy", str(tmp_path / "two"), episodes=1))
-    assert "No card: jinja2 is not installed; pip install" in capsys.readouterr().out
+    assert "No card: jinja2 is not installed; uv pip install" in capsys.readouterr().out
     assert file_hashes(tmp_path / "one") == file_hashes(tmp_path / "two")

@@ -369,6 +369,24 @@ def test_an_entry_of_the_board_is_written_when_its_last_piece_is_made_wherever_t
     assert not git(clone, "status", "--porcelain")
 
 
+def test_entries_that_share_runs_are_written_together(checkout, tmp_path, made, monkeypatch):
+    """Else the one that is whole first would be written anew with every piece, until the other is."""
+    import entries
+
+    asked = []
+    parts = {
+        name: entries.Part("tiny", "a", settings) for name, settings in {"a": ("two",), "b": ("one", "two")}.items()
+    }
+    monkeypatch.setattr(entries, "ENTRIES", parts)
+    for name in parts:
+        (checkout / "board/entries" / name).mkdir(parents=True)
+    monkeypatch.setattr(made, "write_entries", lambda due, *_: asked.append(due) or [])
+    maker = made.Maker(checkout, tmp_path / "store", ["tiny"])
+    maker.make(maker.pieces("tiny/two")[0])
+    maker.make(maker.pieces("tiny/one")[0])
+    assert asked == [[], ["a", "b"]]
+
+
 @pytest.mark.slow
 def test_every_entry_that_is_made_of_a_study_is_on_the_board_and_names_settings_that_the_study_has(made):
     from entries import ENTRIES

