@@ -63,7 +63,7 @@ NOT_RUN = {
     "constructskill-study tinybc.yaml": "of that policy, from a file that the reader writes",
     "constructskill-report --root=outputs/study/tinybc": "of that study",
     "constructskill-compare outputs/study/tinybc": "of that study",
-    "constructskill-compare outputs/study/mine:joint": "of the file that the page shows: mine.yaml is another one here",
+    "constructskill-compare outputs/study/mine:joint": "of the file that the page shows; mine.yaml is another here",
     "constructskill-offline --policies='[outputs/store/runs": "of that study",
     "constructskill-compare 'outputs/mine": "needs seeds of the reader: tests/comparison/test_checkpoints.py",
     "constructskill-check-task --task=lintel_to_wall": "a task of the reader's: tests/test_other_packages.py",
