@@ -34,8 +34,12 @@ has_mesa() { dpkg --compare-versions "$(dpkg-query -W -f '${Version}' mesa-vulka
 install_packages() {
     local package
     for package in $(missing); do apt_install "$package" || say "apt has no $package"; done
-    has_mesa || { apt_install mesa-vulkan-drivers && has_mesa; } || install_backport || say "no Mesa from $MESA on: constructskill-doctor says what that means"
+    has_mesa || install_backport || upgrade_mesa ||
+        say "no Mesa from $MESA on: constructskill-doctor says what that means"
 }
+
+# apt is content with an older one that is installed, as long as its lists are old.
+upgrade_mesa() { apt update && apt install -y --no-install-recommends mesa-vulkan-drivers && has_mesa; }
 
 # Debian 12 has a newer Mesa in its backports, which its own mirror has as well.
 install_backport() {

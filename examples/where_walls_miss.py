@@ -18,7 +18,7 @@ import pandas as pd
 from lerobot_constructskill.demos.precise import yaw_of
 from lerobot_constructskill.envs.gym_env import ConstructSkillEnv
 from lerobot_constructskill.envs.recording import RECORDINGS, Episode, read_recordings
-from lerobot_constructskill.study.rows import read_rows
+from lerobot_constructskill.study.rows import ROWS, read_rows
 
 WITHIN = (5, 10, 20, 50)
 """Millimetres off in x and y. From the last on, an element was not laid but carried elsewhere."""
@@ -70,13 +70,13 @@ def gripped(file: Path) -> list[tuple[float, float]]:
 
 
 def main(study: Path, store: Path | None = None) -> None:
-    rows = read_rows(study / "rows.parquet").dropna(subset="measures")
+    rows = read_rows(study / ROWS).dropna(subset="measures")
     for (setting, variant), own in rows[rows["lifted"]].groupby(["setting", "variant"]):
         errors = errors_of(own["measures"])
         whole = ", ".join(f"{laid(errors, mm).all(1).sum()} within {mm} mm" for mm in WITHIN)
         told = [f"{len(own)} episodes, whole walls: {whole}"]
-        for seed, of_seed in own.groupby("training_seed"):
-            first = errors_of(of_seed["measures"])[:, 0]
+        for seed in sorted(own["training_seed"].unique()):
+            first = errors[own["training_seed"] == seed, 0]
             x = first[laid(first, WITHIN[-1]), 0]
             told.append(f"training seed {seed}: the first is {x.mean():+.1f} mm off along x, spread {x.std():.1f}")
         files = [store / "runs" / run / RECORDINGS for run in own["run"].unique()] if store else []

@@ -95,13 +95,17 @@ class Perturbation:
 
     def check(self, task: Task) -> None:
         """Raise InputError where another size is asked of a task without a brick, or other words that it lacks."""
-        if self.amount("size") and not task.is_brick:
-            raise InputError(
-                f"The axis 'size' is EN 771-1's tolerance of a task's one brick; {task.name} has no brick, "
-                "or bricks with sizes of their own."
-            )
+        self.check_size(task.is_brick, task.name)
         if self.amount("language") >= max(1, len(task.rewordings)):
             raise InputError(f"The row of {task.name} has no rewordings of level {self._level('language')}.")
+
+    def check_size(self, is_brick: bool, name: str = "this task") -> None:
+        """Raise InputError where another size is asked of a task whose object is no brick."""
+        if self.amount("size") and not is_brick:
+            raise InputError(
+                f"The axis 'size' is EN 771-1's tolerance of a task's one brick; {name} has no brick, "
+                "or bricks with sizes of their own."
+            )
 
     def told(self, task: Task) -> Task:
         """The row of `task` with the sentence that is said: its own, one that means the same, or another task's."""

@@ -111,6 +111,14 @@ def test_backports_that_are_there_already_are_not_added(machine):
     assert BACKPORT in calls and (machine.folder / "sources").read_text() == "of the administrator"
 
 
+def test_an_old_mesa_is_upgraded_from_new_lists_where_there_are_no_backports(machine):
+    for package in SYSTEM:
+        (machine.folder / "installed" / package).write_text("24.0")
+    status, said, calls = machine(MIRROR="", CANDIDATE="25.0")
+    assert status == 0 and "no Mesa" not in said
+    assert calls.index("apt-get -qq update") < calls.index(f"{INSTALL} mesa-vulkan-drivers")
+
+
 @pytest.mark.parametrize(
     ("short_of", "said"),
     [
@@ -133,6 +141,15 @@ def test_a_machine_without_uv_gets_its_own(machine):
     assert status == 0 and "pip install --quiet --disable-pip-version-check uv" in calls
     assert any(call.startswith(PIP) for call in calls)
     assert (machine.folder / ".venv" / "bin" / "uv").is_file(), "whoever enters .venv finds it"
+
+
+def test_a_uv_that_lives_in_the_environment_stays_there(machine):
+    own = machine.folder / ".venv" / "bin"
+    own.mkdir(parents=True)
+    (own / "python").symlink_to(sys.executable)
+    (machine.bin / "uv").rename(own / "uv")
+    status, *_ = machine(PATH=f"{own}:{machine.bin}:/usr/bin:/bin")
+    assert status == 0 and not (own / "uv").is_symlink()
 
 
 def test_a_machine_without_a_fitting_python_is_given_one_by_uv(machine):

@@ -156,11 +156,7 @@ class PickPlaceEnv(BaseEnv):
     ):
         self.film = film
         self.draws = Draws(perturbation or Perturbation())
-        if self.draws.perturbation.amount("size") and not self.is_brick:
-            raise InputError(
-                "The axis 'size' is EN 771-1's tolerance of a task's one brick; this task has no brick, "
-                "or bricks with sizes of their own."
-            )
+        self.draws.perturbation.check_size(self.is_brick)
         if self.draws.latency and control_mode != HOLDING:
             raise InputError(f"The axis 'latency' delays actions of {HOLDING}, not of {control_mode}.")
         self.object_size = self.draws.brick(self.object_size)

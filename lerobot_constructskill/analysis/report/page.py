@@ -78,10 +78,11 @@ def write_report(root: Path) -> Path:
     if unknown := set(rows["setting"]) - set(environments):
         raise InputError(f"'{root / STUDY}' has no setting '{min(unknown)}', which rows in {ROWS} are of.")
     figures.write_figures(findings, root / "figures")
+    shipped = _shipped(name, rows)
     context = {
         "name": name,
-        "is_shipped": _is_shipped(name, rows),
-        "seeds": partial(_seeds, name, rows),
+        "is_shipped": shipped is not None,
+        "seeds": partial(_seeds, shipped, rows),
         "tasks": {setting: env["task"] for setting, env in environments.items()},
         "study": read_text(root / STUDY),
         "findings": findings,
@@ -136,21 +137,21 @@ def provenance(root: Path, rows: pd.DataFrame) -> list[tuple[str, str]]:
     return facts + [(name.replace("_", " "), str(value)) for name, value in others.items()]
 
 
-def _is_shipped(name: str, rows: pd.DataFrame) -> bool:
-    """Whether a study of ours has this name, and all settings and variants of the rows."""
+def _shipped(name: str, rows: pd.DataFrame) -> dict[str, Any] | None:
+    """The study of ours that has this name, and all settings and variants of the rows; None if there is none."""
     if name not in names("study"):
-        return False
+        return None
     study = read_fields(find("study", name))
-    return {*rows["setting"]} <= {*study["settings"]} and {*rows["variant"]} <= {
-        *study["variants"],
-        *study.get("references", {}),
-    }
+    arms = {*study["variants"], *study.get("references", {})}
+    return study if {*rows["setting"]} <= {*study["settings"]} and {*rows["variant"]} <= arms else None
 
 
-def _seeds(name: str, rows: pd.DataFrame, setting: str, variant: str) -> str:
+def _seeds(shipped: dict[str, Any] | None, rows: pd.DataFrame, setting: str, variant: str) -> str:
     """The flag that makes as many seeds of a study of ours as were made, where these are fewer than its file has."""
+    if shipped is None:
+        return ""
     made = ran(rows).query("setting == @setting and variant == @variant")["training_seed"].nunique()
-    planned = read_fields(find("study", name))["variants"][variant].get("seeds", Variant.seeds)
+    planned = shipped["variants"][variant].get("seeds", Variant.seeds)
     return f" --seeds={made}" if 0 < made < planned else ""
 
 
